@@ -19,7 +19,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import pytest
 from sqlalchemy.engine import make_url
 
-from services.cli.imports import collection_paused
+from services.cli import collection_paused
 from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings

@@ -11,8 +11,8 @@ from rich.progress import Progress
 
 from placewise.answers import Generation, Job
 from placewise.client import Client, Work
+from services.cli import collection_paused
 from services.cli.environment import read_settings
-from services.cli.imports import collection_paused
 from services.cli.output import print_note
 from shared.config.command_line import command_line
 from shared.config.embedded_home import RunningServer, find_running_server

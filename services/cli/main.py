@@ -18,58 +18,58 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-# Panel of the help -> command -> (module below services.cli, attribute), in the order of the help.
-PANELS = {
-    "Photos and maps": {
-        "index": ("ingest.index", "index"),
-        "query": ("query", "query"),
-        "track": ("track.command", "track"),
-        "locate": ("locate.command", "locate"),
-        "export": ("export", "app"),
-        "maps": ("maps", "app"),
-    },
-    "Descriptors and accuracy": {
-        "vocabulary": ("descriptors.vocabulary", "app"),
-        "pca": ("descriptors.pca", "app"),
-        "models": ("descriptors.models", "app"),
-        "describe": ("descriptors.describe", "describe"),
-        "evaluate": ("evaluation.command", "evaluate"),
-    },
-    "Services": {
-        "serve": ("operations.servers", "serve"),
-        "gateway": ("operations.servers", "gateway"),
-        "extractor": ("operations.servers", "extractor"),
-        "search": ("operations.servers", "search"),
-        "steward": ("operations.servers", "steward"),
-        "migrate": ("operations.servers", "migrate"),
-        "config": ("environment", "config"),
-        "doctor": ("operations.doctor", "doctor"),
-    },
-    "Operation": {
-        "keys": ("operations.keys", "app"),
-        "storage": ("operations.storage", "app"),
-        "verify": ("operations.storage", "verify"),
-        "backup": ("operations.backup", "backup"),
-        "restore": ("operations.backup", "restore"),
-        "rebuild-catalog": ("operations.backup", "rebuild_catalog"),
-    },
-}
-# The lab's commands, as above, below lab.cli. They exist where `lab` stands beside `services`: in a
-# clone of the repository, but in no image. Its `evaluate` replaces that of the service.
-LAB_PANEL = "Descriptors and accuracy"
-LAB_COMMANDS = {
-    "evaluate": ("evaluation.commands", "evaluate"),
-    "compare": ("evaluation.commands", "compare"),
-    "train": ("training.commands", "train"),
-    "grid": ("training.commands", "grid"),
-    "datasets": ("datasets.commands", "app"),
-    "bench": ("bench", "app"),
-}
-ROOT = Path(__file__).parents[2]
-
+from services.cli import collection_paused
 
 Commands = dict[str, tuple[str, str, str]]
-"""Name of a command -> its panel, module and attribute"""
+"""Name of a command -> its panel in the help, module and attribute"""
+
+# In the order of the help.
+PANELS = {
+    "Photos and maps": {
+        "index": "services.cli.ingest.index:index",
+        "query": "services.cli.query:query",
+        "track": "services.cli.track.command:track",
+        "locate": "services.cli.locate.command:locate",
+        "export": "services.cli.export:app",
+        "maps": "services.cli.maps:app",
+    },
+    "Descriptors and accuracy": {
+        "vocabulary": "services.cli.descriptors.vocabulary:app",
+        "models": "services.cli.descriptors.models:app",
+        "describe": "services.cli.descriptors.describe:describe",
+        "evaluate": "services.cli.evaluate:evaluate",
+    },
+    "Services": {
+        "serve": "services.cli.operations.servers:serve",
+        "gateway": "services.cli.operations.servers:gateway",
+        "extractor": "services.cli.operations.servers:extractor",
+        "search": "services.cli.operations.servers:search",
+        "steward": "services.cli.operations.servers:steward",
+        "migrate": "services.cli.operations.servers:migrate",
+    },
+    "Operation": {
+        "config": "services.cli.environment:config",
+        "doctor": "services.cli.operations.doctor:doctor",
+        "keys": "services.cli.operations.keys:app",
+        "storage": "services.cli.operations.storage:app",
+        "verify": "services.cli.operations.storage:verify",
+        "backup": "services.cli.operations.backup:backup",
+        "restore": "services.cli.operations.backup:restore",
+        "rebuild-catalog": "services.cli.operations.backup:rebuild_catalog",
+    },
+}
+# The lab's commands exist where `lab` stands beside `services`: in a clone of the repository, but
+# in no image. Its `evaluate` replaces that of the service.
+LAB_PANEL = "Descriptors and accuracy"
+LAB_COMMANDS = {
+    "evaluate": "lab.cli.evaluation.commands:evaluate",
+    "compare": "lab.cli.evaluation.commands:compare",
+    "train": "lab.cli.training.commands:train",
+    "grid": "lab.cli.training.commands:grid",
+    "datasets": "lab.cli.datasets.commands:app",
+    "bench": "lab.cli.bench:app",
+}
+ROOT = Path(__file__).parents[2]
 
 
 def list_commands(root: Path = ROOT) -> Commands:
@@ -81,11 +81,10 @@ def list_commands(root: Path = ROOT) -> Commands:
     has_lab = (root / "lab" / "cli" / "__init__.py").is_file()
     found: Commands = {}
     for panel, commands in PANELS.items():
-        for name, (module, attribute) in commands.items():
-            found[name] = (panel, f"services.cli.{module}", attribute)
-        if has_lab and panel == LAB_PANEL:
-            for name, (module, attribute) in LAB_COMMANDS.items():
-                found[name] = (panel, f"lab.cli.{module}", attribute)
+        of_the_lab = LAB_COMMANDS if has_lab and panel == LAB_PANEL else {}
+        for name, target in (commands | of_the_lab).items():
+            module, _, attribute = target.partition(":")
+            found[name] = panel, module, attribute
     return found
 
 
@@ -165,8 +164,6 @@ def run() -> None:
     if sys.argv[1:] in ([], ["--help"], ["--version"]):
         app = _build_overview()
     else:
-        from services.cli.imports import collection_paused
-
         # The suggestion of a similar name, for a typo, needs every command.
         with collection_paused():
             app = build_app(names if names[0] in COMMANDS else None)

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import sys
 from typing import Annotated
+from uuid import UUID
 
 import typer
 
 from placewise.answers import Map
-from services.cli.client import connect, wait_for_job
-from services.cli.extractor_options import PreprocessingOption, extractor_name
+from services.cli.client import active_generation, connect, wait_for_job
 from services.cli.output import (
     JsonOption,
     KeyOption,
     ServerOption,
     Table,
+    format_pca,
     print_json,
     print_result,
     print_table,
     progress_bar,
 )
-from shared.errors import Conflict
-from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
+from shared.errors import Conflict, InvalidRequest
+from shared.extractor_config.configs import MAX_PCA_DIMENSION, MIN_PHOTOS_TO_FIT
 
 app = typer.Typer(
     help="Manage maps: named photo databases, each with its own extractor and vocabulary."
@@ -68,9 +69,11 @@ def _format_dimension(map_: Map) -> str:
 def create(
     name: MapName,
     extractor: Annotated[
-        str | None, typer.Option(help="Extractor of the map. Default: the setting EXTRACTOR.")
+        str | None,
+        typer.Option(
+            help="Extractor of the map, with options as in EXTRACTOR. Default: that setting."
+        ),
     ] = None,
-    preprocessing: PreprocessingOption = None,
     place_labels_are_paths: Annotated[
         bool | None,
         typer.Option(
@@ -91,8 +94,6 @@ def create(
     as_json: JsonOption = False,
 ) -> None:
     """Create an empty map."""
-    if preprocessing is not None:
-        extractor = extractor_name(extractor, None, preprocessing=preprocessing)
     with connect(server, None, key) as client:
         created = client.create_map(
             name, extractor, place_labels_are_paths=place_labels_are_paths, rows=rows
@@ -133,35 +134,56 @@ def _describe_auto_fit(map_: Map) -> str:
 def switch(
     name: MapName,
     extractor: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--extractor", help="Extractor name, for example gsv:NAME for an added model."
         ),
-    ],
+    ] = None,
     vocabulary: Annotated[
-        str | None,
+        UUID | None,
         typer.Option(
             metavar="ID",
             help="Vocabulary of the map. Default: the one shipped with the extractor, if any.",
+        ),
+    ] = None,
+    pca: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=MAX_PCA_DIMENSION,
+            help="Dimensions to keep by PCA whitening, fitted on the map's descriptors; 0 for full "
+            "descriptors.",
         ),
     ] = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Reindex a map with another extractor.
+    """Reindex a map with another extractor or vocabulary, or with shorter descriptors.
 
     Searches use the current descriptors until the new ones are complete.
     """
+    if extractor is None and vocabulary is None and pca is None:
+        raise InvalidRequest("no_option", "Specify --extractor, --vocabulary or --pca.")
     with connect(server, name, key) as client, progress_bar() as progress:
-        started = client.start_generation(extractor=extractor, vocabulary_id=vocabulary)
+        if pca == 0 and extractor is None and vocabulary is None:
+            active = active_generation(client)
+            if active is None or active.pca_from is None:
+                raise Conflict("not_reduced", "The map's descriptors are not reduced by PCA.")
+            vocabulary = active.vocabulary_id
+        started = client.start_generation(
+            extractor=extractor, vocabulary_id=vocabulary, pca=pca or None
+        )
         job = wait_for_job(client, started, progress, "switching")
     result = job.result or {}
+    size = f"{result['dimension']} dimensions"
+    if whitening := result.get("pca"):
+        size = format_pca(whitening)
     print_result(
         job,
         as_json,
-        f"Map {name} now uses {extractor}: {result['photos']} photos, "
-        f"{result['dimension']} dimensions, {result['failed']} failed.",
+        f"Map {name} now uses {extractor or 'other descriptors'}: {result['photos']} photos, "
+        f"{size}, {result['failed']} failed.",
     )
 
 

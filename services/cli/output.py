@@ -116,6 +116,14 @@ def format_percent(share: float | None) -> str:
     return "-" if share is None else f"{100 * share:.1f} %"
 
 
+def format_pca(pca: Json) -> str:
+    """Return the sizes and the explained variance of a PCA whitening."""
+    return (
+        f"{pca['dimension']} of {pca['from_dimension']} dimensions with "
+        f"{format_percent(pca['explained'])} of the variance of {pca['rows']} rows"
+    )
+
+
 def print_json(value: Any) -> None:
     """Print a value as JSON; answers of the server as the server sent them."""
     text = json.dumps(value, indent=2, ensure_ascii=False, default=methodcaller("as_json"))

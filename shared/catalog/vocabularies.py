@@ -199,8 +199,8 @@ def get_pca_source_generation(session: Session, map_id: UUID) -> Generation:
         raise Conflict(
             "already_reduced",
             f"The map's descriptors are already reduced to {active.dimension} dimensions by PCA. "
-            "Go back to full descriptors first: `placewise pca undo`, or POST /api/v1/generations "
-            "with only the vocabulary.",
+            "Go back to full descriptors first: `placewise maps switch NAME --pca 0`, or POST "
+            "/api/v1/generations with only the vocabulary.",
             dimension=active.dimension,
         )
     return active

@@ -12,70 +12,19 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
-import torch
-from PIL import Image
-from PIL.ExifTags import GPS, IFD
 
-from tests.support.photos import photo_bytes, photo_image
-from tests.support.server import ServerProcess, environment, run_command
+from tests.support.photos import exif_with_position, photo_bytes, photo_image
+from tests.support.server import CommandLine, Run, ServerProcess, environment, run_command
 
 PHOTOS = 50  # from as many on, `index` fits a vocabulary
-WIDTH = 16  # of the tiny extractor's local features
 SETTINGS = {"extractor": "test-tiny-vlad"}
 
 # Turin's Mole in UTM: 396878 m east, 4991561 m north in zone 32T is 45.07 N, 7.69 E.
 UTM_SHORT = "@0396877.76@4991561.25@.jpg"
 UTM_FULL = "@396877.76@4991561.25@32@T@@@pano@@123.5@@@@20260501@@.jpg"
 UTM_WITH_DEGREES = "@396877.76@4991561.25@32@T@45.5@-7.25@pano@@@@@@@@.jpg"
-
-
-@dataclass(slots=True)
-class Run:
-    """A finished command."""
-
-    process: subprocess.CompletedProcess[str]
-
-    @property
-    def code(self) -> int:
-        return self.process.returncode
-
-    @property
-    def stdout(self) -> str:
-        return self.process.stdout
-
-    @property
-    def stderr(self) -> str:
-        return self.process.stderr
-
-    def json(self, code: int = 0) -> Any:
-        """The answer of a command run with --json: all of stdout."""
-        assert self.code == code, self.stderr + self.stdout
-        assert "Traceback" not in self.stderr
-        return json.loads(self.stdout)
-
-    def refusal(self, code: str) -> str:
-        """The `detail` of a problem printed with --json."""
-        body = self.json(1)
-        assert body["code"] == code, body
-        assert body["type"] == f"urn:placewise:problem:{code}"
-        assert set(body) >= {"title", "status", "detail"}
-        detail: str = body["detail"]
-        return detail
-
-
-class CommandLine:
-    """Runs `placewise` in a folder, with the PLACEWISE_HOME of a server or of none."""
-
-    def __init__(self, folder: Path, home: Path, **settings: Any) -> None:
-        self.folder = folder
-        self.environment = environment(home, **settings)
-
-    def __call__(self, *arguments: str | Path) -> Run:
-        return Run(run_command(*arguments, env=self.environment, cwd=self.folder))
 
 
 @pytest.fixture
@@ -86,16 +35,7 @@ def placewise(server: ServerProcess, tmp_path: Path) -> CommandLine:
 
 def with_gps(number: int) -> bytes:
     """A photo whose EXIF says 45 30' N, 7 15' E."""
-    exif = Image.Exif()
-    exif.get_ifd(IFD.GPSInfo).update(
-        {
-            GPS.GPSLatitudeRef: "N",
-            GPS.GPSLatitude: (45.0, 30.0, 0.0),
-            GPS.GPSLongitudeRef: "E",
-            GPS.GPSLongitude: (7.0, 15.0, 0.0),
-        }
-    )
-    return photo_bytes(number, exif=exif)
+    return photo_bytes(number, exif=exif_with_position(45.5, 7.25))
 
 
 def truncated(number: int) -> bytes:
@@ -130,8 +70,9 @@ def indexed(server: ServerProcess, tmp_path_factory: pytest.TempPathFactory) -> 
     (folder / "notes.txt").write_text("no photo, and not looked at")
     (folder / "exif.jpg").write_bytes(with_gps(0))
     (folder / UTM_FULL).write_bytes(photo_bytes(1))
+    (folder / UTM_SHORT).write_bytes(photo_bytes(3))
     (folder / UTM_WITH_DEGREES).write_bytes(photo_bytes(2))
-    for number in range(3, PHOTOS):
+    for number in range(4, PHOTOS):
         (folder / "below" / f"{number}.JPG").write_bytes(photo_bytes(number))
     broken, cut_off = folder / "broken.jpg", folder / "cut-off.jpg"
     broken.write_bytes(b"Only text, named as a photo.")
@@ -139,20 +80,18 @@ def indexed(server: ServerProcess, tmp_path_factory: pytest.TempPathFactory) -> 
 
     command = CommandLine(folder.parent, server.home)
     assert command("maps", "create", "waiting").code == 0
-    without_fit = command("index", folder, "--map", "waiting", "--no-fit", "--json")
+    index = ("index", folder, "--utm-zone", "32T")
+    without_fit = command(*index, "--map", "waiting", "--no-fit", "--json")
     listed = command("maps", "list", "--json").json()
     assert {map_["name"]: map_["auto_fit"] for map_ in listed} == {
         "default": True,
         "waiting": False,
     }
     assert command("maps", "delete", "waiting", "--yes").code == 0
-    with_fit = command("index", folder, "--json")
+    with_fit = command(*index, "--json")
     broken.unlink()
     cut_off.unlink()
-    return Indexed(folder, without_fit, with_fit, command("index", folder))
-
-
-# --- index -----------------------------------------------------------------------------------
+    return Indexed(folder, without_fit, with_fit, command(*index))
 
 
 def test_index_uploads_a_folder_and_names_what_is_refused(indexed: Indexed) -> None:
@@ -188,13 +127,14 @@ def test_index_reads_places_from_exif_and_from_names(
     found = coordinates(server)
     assert found["exif.jpg"] == pytest.approx((45.5, 7.25))
     assert found[UTM_FULL] == pytest.approx((45.07, 7.69), abs=1e-6)
+    assert found[UTM_SHORT] == pytest.approx((45.07, 7.69), abs=1e-6)
     assert found[UTM_WITH_DEGREES] == (45.5, -7.25)
-    assert found["3.JPG"] == (None, None)
-    named = server.client.get("/api/v1/search", params={"filename": "3.JPG"}).json()["images"]
+    assert found["4.JPG"] == (None, None)
+    named = server.client.get("/api/v1/search", params={"filename": "4.JPG"}).json()["images"]
     paths = {image["original_filename"]: image["relative_path"] for image in named}
-    assert paths["3.JPG"] == "below/3.JPG"  # 13.JPG is found, too
+    assert paths["4.JPG"] == "below/4.JPG"  # 14.JPG is found, too
     assert (
-        f"1 other file skipped (1 .txt), {PHOTOS - 3} photos without coordinates."
+        f"1 other file skipped (1 .txt), {PHOTOS - 4} photos without coordinates."
         in indexed.without_the_broken.stderr
     )
     headed = server.client.get("/api/v1/search", params={"filename": UTM_FULL}).json()["images"]
@@ -234,34 +174,6 @@ def test_index_reads_places_from_a_table(
         "bath.jpg": (45.5, 7.25, "bath", []),
         "plain.jpg": (None, None, None, []),
     }
-
-
-def test_index_refuses_what_it_can_not_place(placewise: CommandLine, tmp_path: Path) -> None:
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    assert str(empty) in placewise("index", empty, "--json").refusal("no_photos")
-
-    (empty / UTM_SHORT).write_bytes(photo_bytes(104))
-    assert "--utm-zone" in placewise("index", empty, "--json").refusal("no_utm_zone")
-
-    table = tmp_path / "places.csv"
-    table.write_text("filename,place\nmissing.jpg,nowhere\n")
-    detail = placewise("index", empty, "--csv", table, "--json").refusal("bad_table")
-    assert "missing.jpg" in detail
-    assert "line 2" in detail
-
-
-@pytest.mark.usefixtures("indexed")
-def test_index_takes_the_zone_of_short_names(
-    server: ServerProcess, placewise: CommandLine, tmp_path: Path
-) -> None:
-    (tmp_path / "short").mkdir()
-    (tmp_path / "short" / UTM_SHORT).write_bytes(photo_bytes(105))
-    placewise("index", tmp_path / "short", "--utm-zone", "32T", "--json").json()
-    assert coordinates(server)[UTM_SHORT] == pytest.approx((45.07, 7.69), abs=1e-6)
-
-
-# --- query -----------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("indexed")
@@ -332,47 +244,12 @@ def test_commands_name_the_map_and_the_server_that_they_use(
     assert f"Next: PLACEWISE_HOME={home} " in indexed.without_the_broken.stderr
     elsewhere = CommandLine(tmp_path, tmp_path / "other home")
     assert elsewhere("maps", "create", "yard", "--server", url).code == 0
-    report = elsewhere("index", indexed.folder, "--map", "yard", "--no-fit", "--server", url)
+    options = ("--utm-zone", "32T", "--map", "yard", "--no-fit", "--server", url)
+    report = elsewhere("index", indexed.folder, *options)
     assert f"Indexing into map yard of {url}\n" in report.stderr
     assert f"query PHOTO --map yard --server {url}\n" in report.stderr
     assert elsewhere("maps", "delete", "yard", "--yes", "--server", url).code == 0
     assert not (tmp_path / "other home").exists()
-
-
-# --- vocabulary ------------------------------------------------------------------------------
-
-
-def test_vocabularies_are_fitted_imported_and_listed(
-    server: ServerProcess, placewise: CommandLine, indexed: Indexed, tmp_path: Path
-) -> None:
-    fit = placewise("vocabulary", "fit", "--clusters", "5", "--seed", "3", "--json").json()
-    assert fit["state"] == "succeeded"
-    assert fit["result"]["clusters"] == 5
-
-    centres = np.random.default_rng(0).standard_normal((8, WIDTH)).astype(np.float32)
-    np.save(tmp_path / "centres.npy", centres)
-    from_npy = placewise("vocabulary", "import", tmp_path / "centres.npy", "--json").json()
-    assert from_npy["result"]["clusters"] == 8
-    torch.save(torch.from_numpy(centres[:6]).clone(), tmp_path / "c_centers.pt")
-    shown = placewise("vocabulary", "import", tmp_path / "c_centers.pt")
-    assert shown.code == 0, shown.stderr
-    assert "6 clusters, 1 failed" in shown.stdout, "cut-off.jpg is tried again"
-
-    listed = placewise("vocabulary", "list", "--json").json()
-    assert [(v["origin"], v["clusters"], v["active"]) for v in listed[:3]] == [
-        ("imported", 6, True),
-        ("imported", 8, False),
-        ("fitted", 5, False),
-    ]
-    assert listed[0]["provenance"]["imported_from"].startswith("c_centers")
-    assert not any(v["active"] for v in listed[1:])
-
-    np.save(tmp_path / "narrow.npy", centres[:, 1:])
-    refused = placewise("vocabulary", "import", tmp_path / "narrow.npy", "--json")
-    assert f"{WIDTH - 1} dimensions" in refused.refusal("vocabulary_unusable")
-
-
-# --- without a server ------------------------------------------------------------------------
 
 
 def test_commands_work_without_a_server(tmp_path: Path) -> None:
@@ -428,9 +305,6 @@ def test_an_extractor_that_can_not_start_ends_only_what_needs_it(tmp_path: Path)
     assert "Traceback" not in served.stderr
 
 
-# --- config and doctor -----------------------------------------------------------------------
-
-
 def test_config_shows_what_is_in_force_and_no_secret(tmp_path: Path) -> None:
     secret = "postgresql+psycopg://user:hidden-word@db.example/places"
     command = CommandLine(tmp_path, tmp_path / "home", database_url=secret, max_file_size=12345)
@@ -444,11 +318,6 @@ def test_config_shows_what_is_in_force_and_no_secret(tmp_path: Path) -> None:
     assert "MAX_FILE_SIZE" in as_table.stdout
     for run in (as_json, as_table):
         assert "hidden-word" not in run.stdout + run.stderr
-
-
-def test_a_setting_that_can_not_be_read_is_named(tmp_path: Path) -> None:
-    command = CommandLine(tmp_path, tmp_path / "home", batch_photos="many")
-    assert "BATCH_PHOTOS" in command("config", "--json").refusal("bad_setting")
 
 
 @pytest.mark.usefixtures("indexed")

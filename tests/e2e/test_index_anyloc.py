@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +9,7 @@ import pytest
 
 from tests.support.anyloc import AnylocInstallation
 from tests.support.photos import photo_bytes
-from tests.support.server import ServerProcess, environment, run_command
+from tests.support.server import CommandLine, Run, ServerProcess
 
 
 @pytest.fixture(scope="module")
@@ -32,17 +30,13 @@ def anyloc(tmp_path_factory: pytest.TempPathFactory) -> AnylocInstallation:
     return made  # still open: the last rows lie in the write-ahead log
 
 
-def index(
-    server: ServerProcess, anyloc: AnylocInstallation, cwd: Path, *options: str
-) -> subprocess.CompletedProcess[str]:
-    command = ("index", anyloc.uploads, "--anyloc", anyloc.database, *options)
-    ended = run_command(*command, env=environment(server.home), cwd=cwd)
-    assert ended.returncode == 1, ended.stdout + ended.stderr  # a photo is missing
-    return ended
+def index(server: ServerProcess, anyloc: AnylocInstallation, cwd: Path, *options: str) -> Run:
+    database = ("--anyloc", anyloc.database)
+    return CommandLine(cwd, server.home)("index", anyloc.uploads, *database, *options)
 
 
 def import_it(server: ServerProcess, anyloc: AnylocInstallation, cwd: Path) -> dict[str, Any]:
-    report: dict[str, Any] = json.loads(index(server, anyloc, cwd, "--json").stdout)
+    report: dict[str, Any] = index(server, anyloc, cwd, "--json").json(1)  # a photo is missing
     return report
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
-from PIL.ExifTags import GPS, IFD, Base
+from PIL.ExifTags import IFD, Base
 
 from services.cli.locate.sidecars import read_position
-from tests.support.photos import encoded, photo_bytes, photo_image
+from tests.support.photos import encoded, exif_with_position, photo_bytes, photo_image
 from tests.support.server import ServerProcess, environment, run_command
 
 NOON = datetime(2026, 5, 1, 12)  # noqa: DTZ001 the clock of a camera
@@ -22,14 +22,10 @@ LONGITUDE = 7.0
 
 def taken(number: int, seconds: float, latitude: float | None = None) -> bytes:
     """The photo `number` so many seconds after noon."""
-    exif = Image.Exif()
+    exif = Image.Exif() if latitude is None else exif_with_position(latitude, LONGITUDE)
     exif[Base.Model] = "Camera"
     clock = NOON + timedelta(seconds=seconds)
     exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = f"{clock:%Y:%m:%d %H:%M:%S}"
-    if latitude is not None:
-        gps = exif.get_ifd(IFD.GPSInfo)
-        gps[GPS.GPSLatitudeRef], gps[GPS.GPSLongitudeRef] = "N", "E"
-        gps[GPS.GPSLatitude], gps[GPS.GPSLongitude] = (latitude, 0.0, 0.0), (LONGITUDE, 0.0, 0.0)
     return encoded(photo_image(number), "JPEG", quality=90, exif=exif)
 
 

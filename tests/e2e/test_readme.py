@@ -175,33 +175,12 @@ def _answers(port: int) -> bool:
         return False
 
 
-@pytest.mark.parametrize(
-    "target",
-    [
-        "help",
-        "setup",
-        "run",
-        "test",
-        "test-numerics",
-        "test-deploy",
-        "lint",
-        "types",
-        "bench",
-        "demo",
-        "env",
-        "client",
-        "api-page",
-        "clean",
-    ],
-)
-def test_make_knows_the_target(target: str) -> None:
-    subprocess.run(["make", "-n", target], cwd=REPOSITORY, check=True, capture_output=True)
-
-
-def test_make_alone_lists_the_targets() -> None:
+def test_make_alone_lists_its_targets_and_knows_each() -> None:
     done = subprocess.run(["make"], cwd=REPOSITORY, check=True, capture_output=True, text=True)
-    for target in ("setup", "run", "test", "lint", "types", "bench", "demo", "env", "clean"):
-        assert f"make {target} " in done.stdout
+    targets = re.findall(r"^ *make ([a-z-]+) ", done.stdout, re.MULTILINE)
+    expected = {"setup", "run", "test", "lint", "types", "bench", "demo", "env", "clean"}
+    assert set(targets) >= expected
+    subprocess.run(["make", "-n", *targets], cwd=REPOSITORY, check=True, capture_output=True)
 
 
 def assert_shows_the_same(command: Command, real: str) -> None:

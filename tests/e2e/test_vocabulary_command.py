@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
+import torch
 
 from shared.descriptors.vocabulary_file import VocabularyFile, read_vocabulary
 from tests.support.photos import photo_bytes
-from tests.support.server import ServerProcess, environment, run_command
+from tests.support.server import CommandLine, Run, ServerProcess
 
 SETTINGS = {"extractor": "test-tiny-vlad"}
 WIDTH = 16  # of the tiny extractor's local features
@@ -27,15 +25,11 @@ class Folder:
     path: Path
     server: ServerProcess
 
-    def run(self, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-        env = environment(self.server.home, **SETTINGS)
-        return run_command("vocabulary", *arguments, env=env, cwd=self.path)
+    def run(self, *arguments: str | Path) -> Run:
+        return CommandLine(self.path, self.server.home, **SETTINGS)(*arguments)
 
     def json(self, *arguments: str | Path, code: int = 0) -> Any:
-        run = self.run(*arguments, "--json")
-        assert run.returncode == code, run.stderr + run.stdout
-        assert "Traceback" not in run.stderr
-        return json.loads(run.stdout)
+        return self.run("vocabulary", *arguments, "--json").json(code)
 
 
 @pytest.fixture(scope="module")
@@ -73,8 +67,8 @@ def test_the_same_fit_gives_the_same_file_and_fewer_photos_another(
     folder: Folder, fitted: Any
 ) -> None:
     common = ("fit", "photos", "--clusters", "5", "--seed", "3")
-    again = folder.run(*common, "--out", "again.npz")
-    assert again.returncode == 0, again.stderr
+    again = folder.run("vocabulary", *common, "--out", "again.npz")
+    assert again.code == 0, again.stderr
     assert "5 clusters of 16 dimensions from 9 photos, mean cosine 0." in again.stdout
     assert "broken.jpg" in again.stderr
     written = (folder.path / "again.npz").read_bytes()
@@ -92,10 +86,12 @@ def test_a_map_takes_the_file_and_lists_where_it_comes_from(folder: Folder, fitt
     assert listed[0]["provenance"] == {**fitted["provenance"], "imported_from": "city.npz"}
     assert listed[0]["sha256"] == fitted["provenance"]["sha256"]
 
-    np.save(folder.path / "bare.npy", np.eye(4, WIDTH, dtype=np.float32))
-    folder.json("import", "bare.npy")
-    assert folder.json("list")[0]["provenance"]["learnt_with"] == "unknown"
-    shown = folder.run("list").stdout
+    torch.save(torch.eye(4, WIDTH), folder.path / "c_centers.pt")
+    folder.json("import", "c_centers.pt")
+    provenance = folder.json("list")[0]["provenance"]
+    assert provenance["learnt_with"] == "unknown"
+    assert provenance["imported_from"].startswith("c_centers")
+    shown = folder.run("vocabulary", "list").stdout
     for part in ("test-tiny projection square32", "of unknown origin", listed[0]["sha256"][:12]):
         assert part in shown, shown
 
@@ -112,42 +108,38 @@ def test_a_vocabulary_of_a_map_is_exported_as_a_file_that_a_map_takes(
     assert found.centres.sha256 == fitted["provenance"]["sha256"]
     wrong = folder.json("export", listed["vocabulary_id"], "--out", "out.npy", code=1)
     assert wrong["code"] == "bad_out"
-    assert folder.json("export", "../maps", "--out", "a.npz", code=1)["code"] == "bad_id"
+    assert folder.run("vocabulary", "export", "../maps", "--out", "a.npz").code == 2, "no ID"
 
 
 def test_a_map_is_reduced_by_one_command_and_whole_again_by_another(folder: Folder) -> None:
     for number in range(101, 107):
         assert folder.server.upload(photo_bytes(number)).status_code == 202
-    np.save(folder.path / "eight.npy", np.eye(8, WIDTH, dtype=np.float32))
-    folder.json("import", "eight.npy")
+    fit = folder.json("fit", "--clusters", "8", "--seed", "3")
+    assert (fit["result"]["clusters"], fit["result"]["photos"]) == (8, 7)
+    assert folder.json("list")[0]["origin"] == "fitted"
 
     def run(*arguments: str) -> str:
-        env = environment(folder.server.home, **SETTINGS)
-        ended = run_command(*arguments, env=env, cwd=folder.path)
-        assert ended.returncode == 0, ended.stderr + ended.stdout
+        ended = folder.run(*arguments)
+        assert ended.code == 0, ended.stderr + ended.stdout
         return " ".join(ended.stdout.split())
 
-    reported = run("pca", "fit", "--dimension", "3")
+    reported = run("maps", "switch", "default", "--pca", "3")
     assert "7 photos, 3 of 128 dimensions with" in reported
     assert "of the variance of 7 rows, 0 failed" in reported
     assert "3 (PCA" in run("maps", "list")
     assert "PCA: 3 of" in run("vocabulary", "list")
-    assert "7 photos, 128 dimensions, 0 failed" in run("pca", "undo")
-    nothing = run_command(
-        "pca", "undo", env=environment(folder.server.home, **SETTINGS), cwd=folder.path
-    )
-    assert nothing.returncode == 1
-    assert "not_reduced" in nothing.stderr
+    assert "7 photos, 128 dimensions, 0 failed" in run("maps", "switch", "default", "--pca", "0")
+    folder.run("maps", "switch", "default", "--pca", "0", "--json").refusal("not_reduced")
 
 
 def test_a_file_of_another_extractor_is_refused_by_the_map(folder: Folder, fitted: Any) -> None:
     found = read_vocabulary(folder.path / "city.npz")
     other = VocabularyFile(found.centres, {**found.provenance, "layer": "another"})
     (folder.path / "other.npz").write_bytes(other.encode())
-    problem = folder.json("import", "other.npz", code=1)
-    assert problem["code"] == "vocabulary_unusable"
-    assert "layer another" in problem["detail"]
-    assert "layer projection" in problem["detail"]
+    refused = folder.run("vocabulary", "import", "other.npz", "--json")
+    detail = refused.refusal("vocabulary_unusable")
+    assert "layer another" in detail
+    assert "layer projection" in detail
 
 
 @pytest.mark.parametrize(
@@ -167,7 +159,5 @@ def test_a_file_of_another_extractor_is_refused_by_the_map(folder: Folder, fitte
 def test_a_fit_that_can_not_be_is_refused_before_it_begins(
     folder: Folder, arguments: tuple[str, ...], code: str, message: str
 ) -> None:
-    problem = folder.json(*arguments, code=1)
-    assert problem["code"] == code
-    assert message in problem["detail"]
+    assert message in folder.run("vocabulary", *arguments, "--json").refusal(code)
     assert not (folder.path / "a.npz").exists()

@@ -116,3 +116,19 @@ STATS: dict[str, Any] = {
     "jobs": {},
     "counted_at": TIME,
 }
+MAP: dict[str, Any] = {
+    "name": "tower",
+    "extractor": "efficientnet-lite0-vlad128",
+    "version": 0,
+    "photos": 0,
+    "searchable": 0,
+    "labelled_queries": 0,
+    "counted_at": TIME,
+    "generation_id": None,
+    "vocabulary": None,
+    "dimension": None,
+    "pca_from": None,
+    "place_labels_are_paths": True,
+    "rows": "float16",
+    "created_at": TIME,
+}

@@ -34,16 +34,6 @@ def tar_of(members: Members, mode: str = "w", form: int = tarfile.PAX_FORMAT) ->
     return buffer.getvalue()
 
 
-def tar_with(*infos: tuple[tarfile.TarInfo, bytes]) -> bytes:
-    """A tar of members that are described by hand."""
-    buffer = io.BytesIO()
-    with tarfile.open(fileobj=buffer, mode="w") as archive:
-        for info, data in infos:
-            info.size = len(data)
-            archive.addfile(info, io.BytesIO(data))
-    return buffer.getvalue()
-
-
 PACKED: dict[str, Callable[[Members], bytes]] = {
     "zip": zip_of,
     "stored zip": lambda members: zip_of(members, zipfile.ZIP_STORED),

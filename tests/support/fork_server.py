@@ -23,7 +23,7 @@ from typing import Any, cast
 from sqlalchemy.orm import configure_mappers
 
 import services.cli
-from services.cli.imports import collection_paused
+from services.cli import collection_paused
 from shared.config.settings import Settings
 
 # Beside the command's own modules: what they import when they run. A module that is missing here is

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from PIL.ExifTags import Base
+from PIL.ExifTags import GPS, IFD, Base
 
 UNDO_OF_ORIENTATION = {
     1: None,
@@ -53,3 +53,15 @@ def turned_photo(upright: Image.Image, orientation: int, media: str, **options: 
     exif[Base.Orientation] = orientation
     stored = upright if undo is None else upright.transpose(undo)
     return encoded(stored, media, exif=exif, **options)
+
+
+def exif_with_position(latitude: float, longitude: float) -> Image.Exif:
+    """EXIF with coordinates in degrees, north and east if they are positive."""
+    exif = Image.Exif()
+    gps = exif.get_ifd(IFD.GPSInfo)
+    gps[GPS.GPSLatitudeRef], gps[GPS.GPSLatitude] = "SN"[latitude > 0], (abs(latitude), 0.0, 0.0)
+    gps[GPS.GPSLongitudeRef], gps[GPS.GPSLongitude] = (
+        "WE"[longitude > 0],
+        (abs(longitude), 0.0, 0.0),
+    )
+    return exif

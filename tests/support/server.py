@@ -9,6 +9,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -59,6 +60,51 @@ def run_command(
         out.seek(0)
         err.seek(0)
         return subprocess.CompletedProcess(arguments, code, out.read(), err.read())
+
+
+@dataclass(slots=True)
+class Run:
+    """A finished command."""
+
+    process: subprocess.CompletedProcess[str]
+
+    @property
+    def code(self) -> int:
+        return self.process.returncode
+
+    @property
+    def stdout(self) -> str:
+        return self.process.stdout
+
+    @property
+    def stderr(self) -> str:
+        return self.process.stderr
+
+    def json(self, code: int = 0) -> Any:
+        """The answer of a command run with --json: all of stdout."""
+        assert self.code == code, self.stderr + self.stdout
+        assert "Traceback" not in self.stderr
+        return json.loads(self.stdout)
+
+    def refusal(self, code: str) -> str:
+        """The `detail` of a problem printed with --json."""
+        body = self.json(1)
+        assert body["code"] == code, body
+        assert body["type"] == f"urn:placewise:problem:{code}"
+        assert set(body) >= {"title", "status", "detail"}
+        detail: str = body["detail"]
+        return detail
+
+
+class CommandLine:
+    """Runs `placewise` in a folder, with the PLACEWISE_HOME of a server or of none."""
+
+    def __init__(self, folder: Path, home: Path, **settings: Any) -> None:
+        self.folder = folder
+        self.environment = environment(home, **settings)
+
+    def __call__(self, *arguments: str | Path) -> Run:
+        return Run(run_command(*arguments, env=self.environment, cwd=self.folder))
 
 
 class ServerProcess:

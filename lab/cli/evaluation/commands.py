@@ -16,7 +16,7 @@ from typing import Annotated
 import typer
 
 from services.cli.environment import require_packages
-from services.cli.evaluation.command import SampleOption, SeedOption, WordWeightsOption
+from services.cli.evaluate import SampleOption, SeedOption, WordWeightsOption, evaluate_map
 from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption
 from shared.errors import InvalidRequest
 from shared.tracks.motion import parse_motion
@@ -301,8 +301,6 @@ def evaluate(
         evaluate_sets(data, sets, protocol, rule, ground_truth, target, report_options)
         return
     _reject_options("without --data", model_options | file_options | output_options)
-    from services.cli.evaluation.live_map import evaluate_map
-
     evaluate_map(sample, seed, word_weights, map_name, server, key, as_json)
 
 

@@ -34,7 +34,7 @@ from lab.evaluation.results import (
     write_run_files,
 )
 from lab.evaluation.retrieval_metrics import compute_metrics, match_distances
-from services.cli.evaluation.live_map import answers_table
+from services.cli.evaluate import answers_table
 from services.cli.output import (
     Json,
     Table,

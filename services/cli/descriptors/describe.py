@@ -11,18 +11,23 @@ from typing import Annotated
 import typer
 
 from services.cli.environment import read_settings, require_packages
-from services.cli.extractor_options import (
-    AggregatorOption,
-    BackboneOption,
-    FacetOption,
-    LayerOption,
-    PreprocessingOption,
-    TemperatureOption,
-    extractor_name,
-)
-from services.cli.output import JsonOption, print_result, printable_path, progress_bar
+from services.cli.output import JsonOption, print_result, progress_bar
 from shared.errors import InvalidRequest
-from shared.extractor_config.configs import get_extractor_config
+from shared.extractor_config.configs import (
+    EXTRACTOR_AGGREGATORS,
+    EXTRACTOR_CONFIGS,
+    FACETS,
+    PREPROCESSING_NAMES,
+    add_extractor_options,
+    get_extractor_config,
+)
+
+# Keyed by the publisher's names, such as `dinov2_vits14`.
+BACKBONES = {
+    config.backbone.replace("dinov2-", "dinov2_"): name
+    for name, config in EXTRACTOR_CONFIGS.items()
+    if not config.for_tests
+}
 
 
 def describe(
@@ -40,15 +45,15 @@ def describe(
     extractor: Annotated[
         str | None,
         typer.Option(
-            "--extractor",
             help="Extractor name, with options as in EXTRACTOR. Default: the setting EXTRACTOR.",
         ),
     ] = None,
-    backbone: BackboneOption = None,
+    backbone: Annotated[
+        str | None, typer.Option(help=f"Backbone, instead of --extractor: {', '.join(BACKBONES)}.")
+    ] = None,
     checkpoint: Annotated[
         Path | None,
         typer.Option(
-            "--checkpoint",
             exists=True,
             dir_okay=False,
             help="Checkpoint of `placewise train`, instead of --extractor.",
@@ -56,17 +61,29 @@ def describe(
     ] = None,
     weights: Annotated[
         Path | None,
-        typer.Option("--weights", help="DINOv2 weights: .pth, .pt or .safetensors."),
+        typer.Option(help="DINOv2 weights: .pth, .pt or .safetensors."),
     ] = None,
-    layer: LayerOption = None,
-    facet: FacetOption = None,
-    preprocessing: PreprocessingOption = None,
-    aggregator: AggregatorOption = None,
-    temperature: TemperatureOption = None,
+    layer: Annotated[int | None, typer.Option(help="Transformer block, counted from 0.")] = None,
+    facet: Annotated[
+        str | None, typer.Option(help=f"Facet of the transformer layer: {', '.join(FACETS)}.")
+    ] = None,
+    preprocessing: Annotated[
+        str | None,
+        typer.Option(
+            help=f"Resizing and cropping: {', '.join(PREPROCESSING_NAMES)}. "
+            "Default: the extractor's own."
+        ),
+    ] = None,
+    aggregator: Annotated[
+        str | None,
+        typer.Option(help=f"Aggregation of local features: {', '.join(EXTRACTOR_AGGREGATORS)}."),
+    ] = None,
+    temperature: Annotated[
+        float | None, typer.Option(help="Softmax temperature of soft-vlad. Default: 1.")
+    ] = None,
     vocabulary: Annotated[
         Path | None,
         typer.Option(
-            "--vocabulary",
             exists=True,
             dir_okay=False,
             help="VLAD vocabulary: .npz of `vocabulary fit`, .npy, or AnyLoc's c_centers.pt.",
@@ -75,16 +92,14 @@ def describe(
     pca: Annotated[
         Path | None,
         typer.Option(
-            "--pca",
             exists=True,
             dir_okay=False,
-            help="PCA whitening to apply: .safetensors of `pca fit ROWS.npy` or `pca fit DIR`.",
+            help="PCA whitening to apply: .safetensors of `models fit-pca`.",
         ),
     ] = None,
     root: Annotated[
         Path | None,
         typer.Option(
-            "--root",
             exists=True,
             file_okay=False,
             help="With FILE.h5: name photos by paths relative to this folder. Default: as given.",
@@ -102,21 +117,26 @@ def describe(
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     names = _hdf5_names(photos, out, root)
     settings = read_settings()
+    chosen = {"--checkpoint": checkpoint, "--extractor": extractor, "--backbone": backbone}
+    if len(given := [option for option, value in chosen.items() if value is not None]) > 1:
+        raise InvalidRequest("options_contradict", f"{' and '.join(given)} exclude each other.")
     if checkpoint is not None:
-        if extractor is not None:
-            raise InvalidRequest(
-                "options_contradict", "--checkpoint and --extractor exclude each other."
-            )
         extractor = f"gsv:{checkpoint.absolute()}"
-    name = extractor_name(
-        extractor or (settings.new_map_extractor if backbone is None else None),
-        backbone,
-        layer=layer,
-        facet=facet,
-        preprocessing=preprocessing,
-        aggregator=aggregator,
-        temperature=temperature,
-    )
+    elif backbone is not None:
+        if backbone not in BACKBONES:
+            raise InvalidRequest(
+                "unknown_backbone",
+                f"Unknown backbone {backbone!r}. Available: {', '.join(BACKBONES)}.",
+            )
+        extractor = BACKBONES[backbone]
+    options = {
+        "layer": layer,
+        "facet": facet,
+        "preprocessing": preprocessing,
+        "aggregator": aggregator,
+        "temperature": temperature,
+    }
+    name = add_extractor_options(extractor or settings.new_map_extractor, options)
     config = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
     if weights is not None:
         if config.depth is None:
@@ -141,10 +161,10 @@ def describe(
             names=names,
         )
     print_result(
-        result.as_json(),
+        result,
         as_json,
-        f"Wrote {result.rows} rows of {result.spec['dimension']} dimensions to "
-        f"{printable_path(out)} ({config.name}, {result.seconds['total']:.1f} s).",
+        f"Wrote {result['rows']} rows of {result['dimension']} dimensions to {result['file']} "
+        f"({config.name}, {result['seconds']['total']:.1f} s).",
     )
 
 

@@ -12,7 +12,6 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -212,14 +211,10 @@ HLOC_DATASET = "global_descriptor"  # hloc's name of the dataset
 def _open_descriptor_writer(
     file: BinaryIO, shape: tuple[int, int], names: Sequence[str] | None
 ) -> Iterator[Callable[[Any], object]]:
-    """Open a writer for descriptors; call it with successive (b, D) float32 batches.
+    """Open a writer of an (n, D) `.npy` array; call it with successive (b, D) float32 batches.
 
-    Args:
-        file: Output file.
-        shape: (n, D) of all rows.
-        names: None for an `.npy` array. With one name per row, HDF5 is written as by hloc's
-            extract_features: a group per photo with the dataset `global_descriptor`; a `/` in a
-            name creates a nested group.
+    With one name per row, HDF5 is written as by hloc's extract_features: a group per photo with the
+    dataset `global_descriptor`; a `/` in a name creates a nested group.
     """
     if names is None:
         np.lib.format.write_array_header_1_0(
@@ -240,26 +235,6 @@ def _open_descriptor_writer(
         yield write
 
 
-@dataclass(slots=True)
-class _DescriptorFile:
-    """A written file of descriptors, with the extractor spec and timings."""
-
-    out: Path
-    spec: dict[str, Any]
-    rows: int
-    seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
-    """Seconds per stage. Decoding overlaps with description: the sum may exceed `total`."""
-
-    def as_json(self) -> dict[str, Any]:
-        return {
-            "file": printable_path(self.out),
-            "rows": self.rows,
-            "dimension": self.spec["dimension"],
-            "spec": self.spec,
-            "seconds": {stage: round(duration, 3) for stage, duration in self.seconds.items()},
-        }
-
-
 def describe_files(
     photos: Sequence[Path],
     out: Path,
@@ -270,18 +245,21 @@ def describe_files(
     advance: Callable[[int], None],
     *,
     names: Sequence[str] | None = None,
-) -> _DescriptorFile:
+) -> dict[str, Any]:
     """Describe photos and write (photos, dimension) float32 rows to a file atomically.
 
     Args:
         photos: Photo files, in row order.
-        out: Output file: `.npy`, or with `names`, HDF5 in hloc's format.
+        out: Output file: `.npy`, or with `names`, one per photo, HDF5 in hloc's format.
         config: The configuration of the extractor.
         vocabulary: VLAD vocabulary; None for the shipped one.
         pca: PCA whitening to apply, or None.
         settings: Device, precision, batch size and decoder limits.
         advance: Called with the number of photos of each finished batch.
-        names: One name per photo, for HDF5.
+
+    Returns:
+        `file`, `rows`, `dimension`, the `spec` of the extractor, and the `seconds` of each stage.
+        Decoding overlaps with description: the sum may exceed `total`.
 
     Raises:
         Unprocessable: `photos_refused`, which lists every photo that can't be described with the
@@ -297,20 +275,25 @@ def describe_files(
     if whitening is not None:
         whitening.check_compatible(extractor.spec(centres))
         projection = PcaProjection(whitening.whitening, extractor.backbone.device)
-    result = _DescriptorFile(out, extractor.spec(centres, projection), len(photos))
-    result.seconds["load"] = time.perf_counter() - started
+    seconds = defaultdict(float, load=time.perf_counter() - started)
     shape = (len(photos), extractor.dimension(centres, projection))
     refused: list[tuple[Path, PlacewiseError]] = []
     with atomic_write(out) as file, _open_descriptor_writer(file, shape, names) as write:
         for rows in describe_photos(
-            photos, extractor, centres, settings, refused, result.seconds, projection
+            photos, extractor, centres, settings, refused, seconds, projection
         ):
             write(rows)
             advance(len(rows))
         if refused:
             raise _refused_photos_error(refused, len(photos))
-    result.seconds["total"] = time.perf_counter() - started
-    return result
+    seconds["total"] = time.perf_counter() - started
+    return {
+        "file": printable_path(out),
+        "rows": len(photos),
+        "dimension": shape[1],
+        "spec": extractor.spec(centres, projection),
+        "seconds": {stage: round(duration, 3) for stage, duration in seconds.items()},
+    }
 
 
 def load_own_vocabulary(config: ExtractorConfig, vocabulary: Path | None) -> VocabularyFile | None:

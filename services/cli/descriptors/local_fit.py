@@ -1,6 +1,6 @@
 """Fits on local files without a server: VLAD vocabularies and PCA whitenings. Imports torch.
 
-Used by `placewise vocabulary fit DIR` and `placewise pca fit ROWS.npy|DIR`, which import this
+Used by `placewise vocabulary fit DIR` and `placewise models fit-pca`, which import this
 module only when they need it.
 """
 
@@ -48,16 +48,7 @@ def fit_vocabulary_on_folder(
     seed: int | None,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Fit a VLAD vocabulary on the photos below a folder and write it to a file.
-
-    Args:
-        folder: Searched recursively for photos.
-        out: Output file, `.npz`.
-        extractor: Extractor name; None for the default extractor.
-        clusters: Number of cluster centres; None for the extractor's.
-        sample: Maximum number of photos to fit on; None for DEFAULT_SAMPLE_PHOTOS.
-        seed: Seed of the sample and of k-means; None for 0.
-        progress: Shows both stages.
+    """Fit a VLAD vocabulary on the photos below a folder and write it to the `.npz` file `out`.
 
     Returns:
         The file, its clusters, dimension and provenance, and `refused`: photos that could not be
@@ -120,15 +111,9 @@ def fit_pca_locally(
     vocabulary: Path | None,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Fit a PCA whitening on a `.npy` file of rows or on the photos below a folder.
+    """Fit a PCA whitening on an (n, D) `.npy` file or on the photos below a folder.
 
-    Args:
-        source: An (n, D) `.npy` file, or a folder of photos.
-        out: Output file, `.safetensors`.
-        components: Number of dimensions to keep.
-        extractor: For a folder: extractor name; None for the default extractor.
-        vocabulary: For a folder: VLAD vocabulary; None for the shipped one.
-        progress: Shows both stages.
+    The whitening is written to the `.safetensors` file `out`.
 
     Returns:
         The file, its dimensions, the number of rows, the explained variance, its SHA-256, and

@@ -10,7 +10,7 @@ import json
 import os
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -68,15 +68,15 @@ class LocalWeights:
 
     extractor: str
     source: str
-    here: bool
-    """Whether the extractor can be loaded without the network."""
-    note: str | None
-    """Why the weights are not available."""
-    path: str | None
-    size_bytes: int | None
     licence: str
     """Licence stated by the publisher or in the folder of the code, or `none found`."""
-    fingerprint: str | None
+    here: bool = False
+    """Whether the extractor can be loaded without the network."""
+    note: str | None = None
+    """Why the weights are not available."""
+    path: str | None = None
+    size_bytes: int | None = None
+    fingerprint: str | None = None
     """The `backbone_fingerprint` of an extractor spec."""
 
 
@@ -109,24 +109,16 @@ def inspect_weights(
     try:
         found = backbone.find_weights(config, settings.dino_weights)
     except Misconfigured as error:
-        return LocalWeights(
-            config.name, source, False, error.detail, None, None, backbone.licence, None
-        )
+        return LocalWeights(config.name, source, backbone.licence, note=error.detail)
     known = _load_record(found.key)
     if known is None and found.fingerprint is not None:
         on_reading(found.path)
         known = WeightsRecord(found.fingerprint(), found.path.stat().st_size)
         save_record(found.key, known)
-    return LocalWeights(
-        config.name,
-        source,
-        known is not None,
-        None if known else NEVER_LOADED,
-        str(found.path),
-        known.size_bytes if known else None,
-        found.licence,
-        known.fingerprint if known else None,
-    )
+    weights = LocalWeights(config.name, source, found.licence, path=str(found.path))
+    if known is None:
+        return replace(weights, note=NEVER_LOADED)
+    return replace(weights, here=True, **asdict(known))
 
 
 def _has_local_weights(config: ExtractorConfig, settings: Settings) -> bool:

@@ -6,27 +6,16 @@ models of `placewise train` on a server.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.markup import escape
-from rich.progress import (
-    BarColumn,
-    DownloadColumn,
-    Progress,
-    TextColumn,
-    TimeRemainingColumn,
-    TransferSpeedColumn,
-)
 from rich.table import Column
 
 from services.cli.client import connect, wait_for_job
 from services.cli.descriptors.local_weights import (
-    LocalWeights,
     WeightsRecord,
     inspect_weights,
     list_extractor_configs,
@@ -40,6 +29,8 @@ from services.cli.output import (
     ServerOption,
     Table,
     err_console,
+    format_pca,
+    print_failures,
     print_json,
     print_message,
     print_result,
@@ -47,13 +38,9 @@ from services.cli.output import (
     progress_bar,
 )
 from shared.errors import Misconfigured
-from shared.extractor_config.configs import get_extractor_config
+from shared.extractor_config.configs import MAX_PCA_DIMENSION, get_extractor_config
 
-if TYPE_CHECKING:
-    from shared.descriptors.weight_files import OnProgress
-
-
-app = typer.Typer(help="Manage extractor weights and trained models.")
+app = typer.Typer(help="Manage extractor weights, trained models and PCA files.")
 
 
 @app.command("add")
@@ -207,7 +194,12 @@ def fetch(
     from shared.descriptors.backbones import backbone_class  # imports torch
 
     dimension = config.dimension
-    with _download_progress(config.name) as on_progress:
+    with progress_bar() as progress:
+        bar = progress.add_task(f"{escape(config.name)} (bytes)", visible=False)
+
+        def on_progress(done: int, total: int | None) -> None:
+            progress.update(bar, completed=done, total=total, visible=True)
+
         loaded = backbone_class(config).fetch(config, settings.dino_weights, on_progress)
     if loaded is not None:
         dimension = loaded.width
@@ -219,40 +211,46 @@ def fetch(
     if as_json:
         print_json({**asdict(weights), "dimension": dimension})
         return
-    _print_weights(weights, dimension)
+    size_text = _format_megabytes(weights.size_bytes)
+    print_message(f"{weights.extractor}: {dimension} dimensions, {size_text} of weights.")
+    print_message(f"Source: {weights.source}. Path: {weights.path}.")
+    print_message(f"Licence: {weights.licence}. Fingerprint: {weights.fingerprint}.")
     if config.hub is not None and config.name not in settings.allowed_hub_extractors:
         print_message(f"To allow maps to use it, set TORCHHUB_ALLOWED={config.name}")
 
 
-def _print_weights(weights: LocalWeights, dimension: int | None) -> None:
-    for line in (
-        (
-            f"{weights.extractor}: {dimension} dimensions, "
-            f"{_format_megabytes(weights.size_bytes)} of weights."
+@app.command("fit-pca")
+def fit_pca(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="ROWS.npy|DIR",
+            exists=True,
+            help="Rows written by `describe`, or photos below a folder.",
         ),
-        f"Source: {weights.source}. Path: {weights.path}.",
-        f"Licence: {weights.licence}. Fingerprint: {weights.fingerprint}.",
-    ):
-        print_message(line)
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE.safetensors", help="Output file.")],
+    dimension: Annotated[
+        int, typer.Option(min=1, max=MAX_PCA_DIMENSION, help="Number of dimensions to keep.")
+    ] = 512,
+    extractor: Annotated[
+        str | None, typer.Option(help="With DIR: extractor name. Default: the setting EXTRACTOR.")
+    ] = None,
+    vocabulary: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="With DIR: VLAD vocabulary.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Fit a PCA whitening without a server and write it to a file for `describe --pca`."""
+    from services.cli.descriptors.local_fit import fit_pca_locally  # imports torch
 
-
-@contextlib.contextmanager
-def _download_progress(label: str) -> Iterator[OnProgress]:
-    """A progress bar that appears when a download starts."""
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        DownloadColumn(),
-        TransferSpeedColumn(),
-        TimeRemainingColumn(),
-        console=err_console,
-    ) as progress:
-        bar = progress.add_task(escape(label), visible=False)
-
-        def show(done: int, total: int | None) -> None:
-            progress.update(bar, completed=done, total=total, visible=True)
-
-        yield show
+    with progress_bar() as progress:
+        fitted = fit_pca_locally(
+            source, out, dimension, extractor=extractor, vocabulary=vocabulary, progress=progress
+        )
+    if not as_json:
+        print_failures(fitted, "refused")
+    print_result(fitted, as_json, f"{fitted['file']}: {format_pca(fitted)}.")
 
 
 def _format_megabytes(size_bytes: int | None) -> str:

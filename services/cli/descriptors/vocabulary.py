@@ -77,7 +77,27 @@ def fit(
         _reject_options("a map", {"--map": map_name})
         if out is None:
             raise InvalidRequest("bad_out", "Specify the output file: --out FILE.npz")
-        _fit_folder(folder, out, extractor, clusters, sample, seed, as_json)
+        from services.cli.descriptors.local_fit import fit_vocabulary_on_folder  # imports torch
+
+        with progress_bar() as progress:
+            fitted = fit_vocabulary_on_folder(
+                folder,
+                out,
+                extractor=extractor,
+                clusters=clusters,
+                sample=sample,
+                seed=seed,
+                progress=progress,
+            )
+        if not as_json:
+            print_failures(fitted, "refused")
+        photos, cosine = (fitted["provenance"][name] for name in ("photos", "mean_cosine"))
+        print_result(
+            fitted,
+            as_json,
+            f"{fitted['file']}: {fitted['clusters']} clusters of {fitted['dimension']} dimensions "
+            f"from {photos} photos, mean cosine {cosine:.4f}.",
+        )
         return
     _reject_options("a folder (vocabulary fit DIR)", {"--out": out, "--extractor": extractor})
     options = {"clusters": clusters, "sample": sample, "seed": seed}
@@ -121,7 +141,7 @@ def import_(
 @app.command("export")
 def export(
     vocabulary_id: Annotated[
-        str, typer.Argument(metavar="ID", help="Vocabulary ID; see `vocabulary list`.")
+        UUID, typer.Argument(metavar="ID", help="Vocabulary ID; see `vocabulary list`.")
     ],
     out: Annotated[
         Path, typer.Option("--out", metavar="FILE.npz", help="Output file, accepted by `import`.")
@@ -132,7 +152,6 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write a vocabulary of the map to a file: .npz, or .npy if its provenance is unknown."""
-    _validate_id(vocabulary_id)
     with connect(server, map_name, key) as client:
         data = client.vocabulary_file(vocabulary_id)
     suffix = ".npz" if data.startswith(b"PK") else ".npy"
@@ -144,7 +163,7 @@ def export(
     with atomic_write(out) as file:
         file.write(data)
     print_result(
-        {"file": printable_path(out), "vocabulary_id": vocabulary_id, "bytes": len(data)},
+        {"file": printable_path(out), "vocabulary_id": str(vocabulary_id), "bytes": len(data)},
         as_json,
         f"{printable_path(out)}: {len(data)} bytes.",
     )
@@ -183,17 +202,6 @@ def list_(
     print_table(table)
 
 
-def _validate_id(vocabulary_id: str) -> None:
-    """Reject anything but a UUID: the value becomes part of the URL's path."""
-    try:
-        UUID(vocabulary_id)
-    except ValueError:
-        raise InvalidRequest(
-            "bad_id",
-            f"Invalid vocabulary ID {vocabulary_id!r}. List IDs: placewise vocabulary list.",
-        ) from None
-
-
 def _format_provenance(provenance: Json) -> str:
     if "backbone" not in provenance:
         return "of unknown origin"
@@ -214,38 +222,6 @@ def _reject_options(source: str, options: dict[str, object]) -> None:
         raise InvalidRequest(
             "options_contradict", f"{', '.join(invalid)} requires a fit on {source}."
         )
-
-
-def _fit_folder(
-    folder: Path,
-    out: Path,
-    extractor: str | None,
-    clusters: int | None,
-    sample: int | None,
-    seed: int | None,
-    as_json: bool,
-) -> None:
-    from services.cli.descriptors.local_fit import fit_vocabulary_on_folder  # imports torch
-
-    with progress_bar() as progress:
-        fitted = fit_vocabulary_on_folder(
-            folder,
-            out,
-            extractor=extractor,
-            clusters=clusters,
-            sample=sample,
-            seed=seed,
-            progress=progress,
-        )
-    if not as_json:
-        print_failures(fitted, "refused")
-    provenance = fitted["provenance"]
-    print_result(
-        fitted,
-        as_json,
-        f"{fitted['file']}: {fitted['clusters']} clusters of {fitted['dimension']} dimensions from "
-        f"{provenance['photos']} photos, mean cosine {provenance['mean_cosine']:.4f}.",
-    )
 
 
 def _print_generation(job: Job, as_json: bool) -> None:

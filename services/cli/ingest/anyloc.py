@@ -21,6 +21,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from itertools import takewhile
 from pathlib import Path, PureWindowsPath
 from typing import Any
@@ -180,11 +181,11 @@ def _match_rows_to_files(
     listed: list[tuple[Path, AnylocRow]] = []
     missing: list[Json] = []
     for row in rows:
-        path = PureWindowsPath(row.image_path)  # accepts / and \ as separators
-        if path.name in files:
+        recorded = PureWindowsPath(row.image_path)  # accepts / and \ as separators
+        if same_name := files.get(recorded.name):
+            row.name = row.name or recorded.name
             # Of several files with this name, take the one that shares most parent folders.
-            file = max(files[path.name], key=lambda file: _common_suffix_length(file, path))
-            row.name = row.name or path.name
+            file = max(same_name, key=partial(_common_suffix_length, recorded))
             listed.append((file, row))
         else:
             reason = "the database has a row for this file, but the file was not found"
@@ -192,9 +193,9 @@ def _match_rows_to_files(
     return listed, missing
 
 
-def _common_suffix_length(file: Path, path: PureWindowsPath) -> int:
+def _common_suffix_length(recorded: PureWindowsPath, file: Path) -> int:
     """Number of path parts that are equal, counted from the end."""
-    pairs = zip(reversed(file.parts), reversed(path.parts), strict=False)
+    pairs = zip(reversed(file.parts), reversed(recorded.parts), strict=False)
     return len(list(takewhile(lambda pair: pair[0] == pair[1], pairs)))
 
 

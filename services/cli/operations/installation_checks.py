@@ -59,10 +59,9 @@ def check_device(settings: Settings) -> str:
     from shared.descriptors.inference import choose_precision
 
     device = choose_device(settings.device)
-    precision_note = (
-        "precision of new generations: "
-        f"{choose_precision(settings.precision, _default_extractor_config(settings), device)}"
-    )
+    config = settings.extractor_config(settings.new_map_extractor)
+    precision = choose_precision(settings.precision, config, device)
+    precision_note = f"precision of new generations: {precision}"
     if device.type == "cuda":
         name = torch.cuda.get_device_name(device)
         return f"CUDA: {name}, PyTorch {torch.__version__}, {precision_note}"
@@ -82,7 +81,7 @@ def check_memory(settings: Settings) -> str:
     from shared.descriptors.inference import DEFAULT_PHOTO_PIXELS
     from shared.imaging.preprocessing import get_preprocessing
 
-    config = _default_extractor_config(settings)
+    config = settings.extractor_config(settings.new_map_extractor)
     if config.parameters is None or config.preprocessing is None:
         return f"the size of {config.name} is unknown until it is loaded"
     device = choose_device(settings.device)
@@ -127,7 +126,7 @@ def check_extractor(settings: Settings) -> str:
     Raises:
         Misconfigured: The weights are missing or don't fit the extractor.
     """
-    summary = _check_weights(_default_extractor_config(settings), settings)
+    summary = _check_weights(settings.extractor_config(settings.new_map_extractor), settings)
     suggestion = suggest_extractor(settings)
     return f"{summary}; {suggestion}" if suggestion else summary
 
@@ -146,15 +145,11 @@ def _check_weights(config: ExtractorConfig, settings: Settings) -> str:
 
     extractor = load_extractor(config, settings)
     shipped = extractor.shipped_vocabulary()
-    return f"{config.name}: weights {extractor.backbone.fingerprint[:12]} loaded, " + (
-        f"shipped vocabulary of {shipped[0].clusters} centres"
-        if shipped
-        else "no shipped vocabulary"
+    vocabulary = f"shipped vocabulary of {shipped[0].clusters} centres" if shipped else None
+    return (
+        f"{config.name}: weights {extractor.backbone.fingerprint[:12]} loaded, "
+        f"{vocabulary or 'no shipped vocabulary'}"
     )
-
-
-def _default_extractor_config(settings: Settings) -> ExtractorConfig:
-    return settings.extractor_config(settings.new_map_extractor)
 
 
 MIN_FREE_DISK_BYTES = 1_000_000_000
@@ -184,9 +179,7 @@ def _is_installed(package: str) -> bool:
 
 def _check_home(settings: Settings) -> str:
     home = settings.placewise_home
-    existing = next(folder for folder in (home, *home.parents) if folder.exists())
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise OSError(errno.EACCES, "no write permission for this user", str(existing))
+    existing = _writable_parent(home)
     free = shutil.disk_usage(existing).free
     if free < MIN_FREE_DISK_BYTES:
         raise OSError(errno.ENOSPC, f"only {free / 1e9:.1f} GB are free", str(existing))
@@ -195,12 +188,17 @@ def _check_home(settings: Settings) -> str:
 
 
 def _check_upload_dir(settings: Settings) -> str:
-    folder = settings.upload_dir
-    assert folder is not None, "the check is listed only with a folder"
+    assert settings.upload_dir is not None, "the check is listed only with a folder"
+    _writable_parent(settings.upload_dir)
+    return f"{settings.upload_dir} is writable"
+
+
+def _writable_parent(folder: Path) -> Path:
+    """Return the folder, or its nearest parent that exists; raise OSError if it isn't writable."""
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     if not os.access(existing, os.W_OK | os.X_OK):
         raise OSError(errno.EACCES, "no write permission for this user", str(existing))
-    return f"{folder} is writable"
+    return existing
 
 
 def _check_catalog_file(settings: Settings) -> str:

@@ -24,8 +24,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from services.cli import collection_paused
 from services.cli.environment import read_settings
-from services.cli.imports import collection_paused
 from services.cli.output import err_console, print_note
 from shared.config.command_line import command_line
 from shared.config.settings import Settings

@@ -1,4 +1,4 @@
-"""`placewise pca fit` on a file or a folder, and `describe --pca`: without a server."""
+"""`placewise models fit-pca` on a file or a folder, and `describe --pca`: without a server."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_a_folders_whitening_shortens_the_rows_of_the_same_extractor(
 ) -> None:
     file, photos = tmp_path / "city.safetensors", sorted(folder.glob("*.jpg"))
     (tmp_path / "broken").mkdir()
-    fitted = run("pca", "fit", folder, "--dimension", KEPT, "--out", file)
+    fitted = run("models", "fit-pca", folder, "--dimension", KEPT, "--out", file)
     assert (fitted["from_dimension"], fitted["dimension"]) == (16, KEPT)
     assert (fitted["rows"], fitted["refused"]) == (PHOTOS, [])
 
@@ -86,7 +86,7 @@ def test_a_folders_whitening_is_of_the_precision_that_photos_are_described_in(
 ) -> None:
     monkeypatch.setenv("PRECISION", "bfloat16")
     file, photo = tmp_path / "city.safetensors", folder / "0.jpg"
-    run("pca", "fit", folder, "--dimension", KEPT, "--out", file)
+    run("models", "fit-pca", folder, "--dimension", KEPT, "--out", file)
     spec = decode_whitening(file.read_bytes()).spec
     assert spec is not None
     assert spec["precision"] == "bfloat16"
@@ -99,7 +99,7 @@ def test_a_file_of_rows_is_enough(tmp_path: Path) -> None:
     rows[7] = 0  # a photo without anything to describe says nothing
     np.save(tmp_path / "rows.npy", rows)
     file = tmp_path / "rows.safetensors"
-    fitted = run("pca", "fit", tmp_path / "rows.npy", "--dimension", KEPT, "--out", file)
+    fitted = run("models", "fit-pca", tmp_path / "rows.npy", "--dimension", KEPT, "--out", file)
     found = decode_whitening(file.read_bytes())
     assert found.spec is None
     assert (fitted["rows"], found.whitening.rows) == (39, 39)
@@ -117,7 +117,6 @@ def test_a_file_of_rows_is_enough(tmp_path: Path) -> None:
         (np.arange(12).reshape(3, 4), [], "bad_rows", "floating point"),
         (unit_rows()[0], [], "bad_rows", "rows"),
         (unit_rows(), ["--extractor", "test-tiny-avg"], "options_contradict", "--extractor"),
-        (unit_rows(), ["--map", "town"], "options_contradict", "--map"),
         (unit_rows(), ["--out", "no-folder/a.safetensors"], "bad_out", "does not exist"),
         (unit_rows(), ["--out", "a.npz"], "bad_out", ".safetensors"),
     ],
@@ -134,7 +133,7 @@ def test_what_can_not_be_fitted_is_refused_and_nothing_is_written(
     np.save("rows.npy", rows)
     out = [] if "--out" in arguments else ["--out", "a.safetensors"]
     dimension = [] if "--dimension" in arguments else ["--dimension", "4"]
-    problem = run("pca", "fit", "rows.npy", *arguments, *out, *dimension, code=1)
+    problem = run("models", "fit-pca", "rows.npy", *arguments, *out, *dimension, code=1)
     assert problem["code"] == code, problem
     assert message in problem["detail"]
     assert [path.name for path in tmp_path.iterdir()] == ["rows.npy"]
@@ -143,14 +142,9 @@ def test_what_can_not_be_fitted_is_refused_and_nothing_is_written(
 def test_what_is_no_file_of_rows_or_of_a_whitening_is_refused(folder: Path, tmp_path: Path) -> None:
     text = tmp_path / "rows.npy"
     text.write_text("no rows")
-    assert run("pca", "fit", text, "--out", tmp_path / "a.safetensors", code=1)["code"] == (
+    assert run("models", "fit-pca", text, "--out", tmp_path / "a.safetensors", code=1)["code"] == (
         "bad_rows"
     )
     photo = folder / "0.jpg"
     refused = run("describe", photo, "--out", tmp_path / "no.npy", "--pca", text, code=1)
     assert refused["code"] == "pca_unusable"
-    no_out = run("pca", "fit", text, code=1)
-    assert no_out["code"] == "bad_out"
-    for arguments in (["--out", "a.safetensors"], ["--vocabulary", text]):
-        problem = run("pca", "fit", *arguments, code=1)
-        assert problem["code"] == "options_contradict"

@@ -68,7 +68,7 @@ def test_a_map_is_reduced_says_so_and_goes_back(vlad: Service) -> None:
 
     refused = post(vlad, "/generations", {"pca": 3})
     body = problem(refused, 409, "already_reduced")
-    assert "placewise pca undo" in body["detail"]
+    assert "placewise maps switch NAME --pca 0" in body["detail"]
 
     done(vlad, post(vlad, "/generations", {"vocabulary_id": reduced["vocabulary_id"]}))
     assert active(vlad)["spec"] == whole["spec"]

@@ -53,12 +53,6 @@ def free_ports(count: int) -> list[int]:
     return found
 
 
-def accepts(port: int) -> bool:
-    with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1):
-        return True
-    return False
-
-
 def as_nobody() -> list[str]:
     """What goes before a command that refuses root. It keeps root's right to read everything: the
     environment may lie below a folder that others can't enter."""

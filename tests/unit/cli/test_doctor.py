@@ -32,9 +32,6 @@ def settings_with(monkeypatch: pytest.MonkeyPatch, **variables: str | Path) -> S
     return Settings()
 
 
-# --- weights ---------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def small(tmp_path: Path) -> Path:
     """Weights of what `anyloc-vits14:layer=0` needs."""
@@ -148,9 +145,6 @@ def test_the_suggestion_stands_behind_the_default_extractor(
     assert check_extractor(Settings()).endswith("; a better one")
 
 
-# --- device and memory -----------------------------------------------------------------------
-
-
 def test_missing_cuda_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     settings = settings_with(monkeypatch, DEVICE="cuda")
@@ -173,40 +167,29 @@ def test_memory_that_is_enough_is_shown_with_the_estimate(monkeypatch: pytest.Mo
     assert "the GPU has 16.0 GB" in reported
 
 
-def test_a_gpu_that_is_too_small_comes_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    pretend_gpu(monkeypatch, 4 * GB)
-    settings = settings_with(monkeypatch, DINO_MODEL="dinov2_vitg14", DEVICE="cuda")
-    with pytest.raises(Misconfigured) as caught:
-        check_memory(settings)
-    assert caught.value.code == "memory_short"
-    assert "a smaller DINO_MODEL" in caught.value.detail
-    assert "DEVICE=cpu" in caught.value.detail
-    assert "BATCH_PHOTOS" not in caught.value.detail, "the weights alone are too large"
-
-
-def test_a_batch_that_is_too_large_comes_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    pretend_gpu(monkeypatch, 6 * GB)
-    settings = settings_with(
-        monkeypatch, DINO_MODEL="dinov2_vitg14", DEVICE="cuda", BATCH_PHOTOS="64"
-    )
-    with pytest.raises(Misconfigured, match="BATCH_PHOTOS below 64"):
-        check_memory(settings)
-
-
-def test_memory_of_one_large_photo_is_counted_whatever_the_batch(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    ("gpu", "settings", "remedies"),
+    [
+        (4 * GB, {}, "a smaller DINO_MODEL (dinov2_vits14 takes 0.1 GB of weights), or DEVICE=cpu"),
+        (6 * GB, {"BATCH_PHOTOS": "64"}, "BATCH_PHOTOS below 64"),
+        # 21 times the pixels of 224 x 224, whatever the batch
+        (
+            6 * GB,
+            {"BATCH_PHOTOS": "1", "EXTRACTOR": "anyloc-vitg14:preprocessing=demo1024"},
+            "preprocessing square224",
+        ),
+    ],
+)
+def test_memory_of_a_gpu_that_is_too_small_comes_with_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, gpu: int, settings: dict[str, str], remedies: str
 ) -> None:
-    pretend_gpu(monkeypatch, 6 * GB)
-    settings = settings_with(
-        monkeypatch,
-        EXTRACTOR="anyloc-vitg14:preprocessing=demo1024",
-        DEVICE="cuda",
-        BATCH_PHOTOS="1",
-    )
-    with pytest.raises(Misconfigured, match="preprocessing square224") as caught:
-        check_memory(settings)  # 21 times the pixels of 224 x 224
-    assert "6.4 GB (weights 4.5, a batch of 1 photos 0.8)" in caught.value.detail
-    assert "BATCH_PHOTOS" not in caught.value.detail
+    pretend_gpu(monkeypatch, gpu)
+    chosen = {} if "EXTRACTOR" in settings else {"DINO_MODEL": "dinov2_vitg14"}
+    with pytest.raises(Misconfigured) as caught:
+        check_memory(settings_with(monkeypatch, DEVICE="cuda", **chosen, **settings))
+    assert caught.value.code == "memory_short"
+    assert remedies in caught.value.detail
+    assert ("BATCH_PHOTOS" in caught.value.detail) == ("BATCH_PHOTOS" in remedies)
 
 
 def test_ram_that_is_too_small_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:

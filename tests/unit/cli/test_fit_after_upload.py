@@ -11,7 +11,7 @@ from placewise.answers import Job
 from placewise.client import Client
 from services.cli.ingest.upload import wait_for_automatic_fit
 from tests.support.api_responses import JOB, STATS
-from tests.unit.client.test_client import running_server
+from tests.support.fake_server import running_server
 
 FIT = {**JOB, "kind": "fit", "label": "Improving the map", "state": "running"}
 

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 from services.cli.operations.keys import app
 from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
+from tests.support.api_responses import MAP
 from tests.support.catalog_rows import add_map
-from tests.unit.cli.test_maps_command import MAP
-from tests.unit.client.test_client import running_server
+from tests.support.fake_server import running_server
 
 CREATE = ("create", "visitor", "--scope", "read", "--map")
 

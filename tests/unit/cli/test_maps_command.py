@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 from rich.console import Console
@@ -12,46 +11,19 @@ from typer.testing import CliRunner
 
 from services.cli.maps import app
 from shared.errors import Misconfigured
-from tests.support.api_responses import TIME
-from tests.unit.client.test_client import running_server
-
-MAP: dict[str, Any] = {
-    "name": "tower",
-    "extractor": "efficientnet-lite0-vlad128",
-    "version": 0,
-    "photos": 0,
-    "searchable": 0,
-    "labelled_queries": 0,
-    "counted_at": TIME,
-    "generation_id": None,
-    "vocabulary": None,
-    "dimension": None,
-    "pca_from": None,
-    "place_labels_are_paths": True,
-    "rows": "float16",
-    "created_at": TIME,
-}
+from tests.support.api_responses import MAP
+from tests.support.fake_server import FakeServer, running_server
 
 
-def test_create_makes_a_map_whose_labels_are_paths() -> None:
-    with running_server() as server:
-        server.will_answer(201, MAP)
-        arguments = ["create", "tower", "--place-labels-are-paths", "--server", server.url]
-        result = CliRunner().invoke(app, arguments)
+def test_create_sends_the_options_that_are_given(server: FakeServer) -> None:
+    server.will_answer(201, MAP)
+    options = ["--place-labels-are-paths", "--rows", "float16", "--server", server.url]
+    result = CliRunner().invoke(app, ["create", "tower", *options])
     assert result.exit_code == 0, result.output
     _, path, body = server.requests[0]
     assert path == "/api/v1/maps"
-    assert json.loads(body) == {"name": "tower", "place_labels_are_paths": True}
-
-
-def test_create_makes_a_map_with_rows_in_half_precision() -> None:
-    with running_server() as server:
-        server.will_answer(201, MAP)
-        arguments = ["create", "tower", "--rows", "float16", "--server", server.url]
-        result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0, result.output
-    _, _, body = server.requests[0]
-    assert json.loads(body) == {"name": "tower", "rows": "float16"}
+    sent = {"name": "tower", "place_labels_are_paths": True, "rows": "float16"}
+    assert json.loads(body) == sent
 
 
 def test_with_the_settings_of_separate_services_no_server_is_started(

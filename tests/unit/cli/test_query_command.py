@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from services.cli.query import query as query_command
 from tests.support.api_responses import PHOTO, SIMILAR
-from tests.unit.client.test_client import FakeServer, running_server
+from tests.support.fake_server import FakeServer, running_server
 
 PLACES = [
     {"place": "tower/floor 7 [east]/elevator", "probability": 0.614},

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from services.cli.ingest.upload import upload_photos
 from services.cli.ingest.upload_journal import UploadJournal
 from shared.errors import InvalidRequest, NotFound
 from tests.support.api_responses import JOB, JOB_ID, PHOTO_ID, STATS, UPLOADED
-from tests.unit.client.test_client import FakeServer, running_server
+from tests.support.fake_server import FakeServer
 
 TAKEN = Uploaded(**UPLOADED)
 NO_JOBS: dict[str, Any] = {"jobs": [], "next_cursor": None}
@@ -33,12 +32,6 @@ def photo(tmp_path: Path) -> LocalPhoto:
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return tmp_path / "journal.jsonl"
-
-
-@pytest.fixture
-def server() -> Iterator[FakeServer]:
-    with running_server() as made:
-        yield made
 
 
 def test_a_photo_that_was_taken_is_known_to_the_next_run(path: Path, photo: LocalPhoto) -> None:

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import socket
-import threading
 from collections.abc import Iterator
-from email.message import Message
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 from uuid import UUID
 
 import pytest
@@ -33,63 +28,7 @@ from shared.errors import (
     UnsupportedMedia,
 )
 from tests.support.api_responses import JOB, PHOTO_ID, SIMILAR, STARTED, STATS, UPLOADED
-
-
-class FakeServer(HTTPServer):
-    """Answers what the test says and records the requests."""
-
-    def __init__(self) -> None:
-        super().__init__(("127.0.0.1", 0), Handler)
-        self.answers: list[tuple[int, bytes, dict[str, str]]] = []
-        self.headers: list[Message] = []
-        self.requests: list[tuple[str, str, bytes]] = []
-
-    @property
-    def url(self) -> str:
-        return f"http://127.0.0.1:{self.server_address[1]}"
-
-    def will_answer(self, status: int, body: Any, **headers: str) -> None:
-        data = body if isinstance(body, bytes) else json.dumps(body).encode()
-        self.answers.append((status, data, headers))
-
-
-class Handler(BaseHTTPRequestHandler):
-    server: FakeServer
-
-    def answer(self) -> None:
-        body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
-        self.server.requests.append((self.command, self.path, body))
-        self.server.headers.append(self.headers)
-        status, data, headers = self.server.answers.pop(0)
-        self.send_response(status)
-        for name, value in headers.items():
-            self.send_header(name, value)
-        self.send_header("Content-Length", str(len(data)))
-        self.end_headers()
-        self.wfile.write(data)
-
-    do_GET = do_POST = do_PUT = do_DELETE = answer  # noqa: N815
-
-    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
-        """Keep the test's output clean."""
-
-
-@contextlib.contextmanager
-def running_server() -> Iterator[FakeServer]:
-    with FakeServer() as made:
-        thread = threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        try:
-            yield made
-        finally:
-            made.shutdown()
-            thread.join()
-
-
-@pytest.fixture
-def server() -> Iterator[FakeServer]:
-    with running_server() as made:
-        yield made
+from tests.support.fake_server import FakeServer
 
 
 @pytest.fixture
@@ -155,21 +94,15 @@ def test_upload_sends_the_file_and_only_the_fields_that_are_given(
     photo.write_bytes(b"the photo's bytes")
     server.will_answer(202, UPLOADED)
     assert client.upload(photo, latitude=45.5, place=None).file_id == UUID(PHOTO_ID)
+    server.will_answer(202, UPLOADED)
+    client.upload(photo, filename="Piazza Castello.jpg")
+    assert b'filename="Piazza Castello.jpg"' in server.requests[1][2]
     method, path, body = server.requests[0]
     assert (method, path) == ("POST", "/api/v1/upload")
     assert b'filename="street.jpg"' in body
     assert b"the photo's bytes" in body
     assert b"45.5" in body
     assert b"place" not in body
-
-
-def test_upload_may_be_called_otherwise_than_its_file(
-    server: FakeServer, client: Client, tmp_path: Path
-) -> None:
-    (tmp_path / "5f0e.jpg").write_bytes(b"bytes")
-    server.will_answer(202, UPLOADED)
-    client.upload(tmp_path / "5f0e.jpg", filename="Piazza Castello.jpg")
-    assert b'filename="Piazza Castello.jpg"' in server.requests[0][2]
 
 
 def test_key_that_no_header_can_carry_is_refused(server: FakeServer) -> None:
@@ -198,15 +131,6 @@ def test_map_is_named_in_every_call(server: FakeServer) -> None:
     assert server.requests[0][1] == "/api/v1/database/stats?map=lab"
     assert "map=lab" in server.requests[1][1]
     assert "filename=a" in server.requests[1][1]
-
-
-def test_waiting_polls_until_the_job_has_ended(server: FakeServer, client: Client) -> None:
-    for state in ("queued", "running", "succeeded"):
-        server.will_answer(200, {**JOB, "state": state})
-    seen: list[str] = []
-    job = client.wait("abc", on_progress=lambda found: seen.append(found.state))
-    assert job.as_json() == JOB
-    assert seen == ["queued", "running", "succeeded"]
 
 
 def test_query_that_takes_longer_is_fetched_when_its_job_has_ended(

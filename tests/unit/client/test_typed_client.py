@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,7 +22,7 @@ from services.gateway.routes import stats as stats_module
 from services.gateway.tracks.schemas import TrackStateResponse
 from shared.search_api.comparison import ClusterContribution, SimilarityExplanation
 from tests.support.api_responses import JOB, PHOTO, SIMILAR, STARTED, UPLOADED
-from tests.unit.client.test_client import FakeServer, running_server
+from tests.support.fake_server import FakeServer
 from tools.make_sync_client import GENERATED_FILES, ROOT, to_synchronous
 
 SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
@@ -60,12 +59,6 @@ SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
     (answers.Key, keys.KeyResponse),
     (answers.CreatedKey, keys.CreatedKeyResponse),
 ]
-
-
-@pytest.fixture
-def server() -> Iterator[FakeServer]:
-    with running_server() as made:
-        yield made
 
 
 @pytest.mark.parametrize("source", GENERATED_FILES)
@@ -108,17 +101,6 @@ def test_answers_are_typed_and_keep_what_a_newer_server_adds(server: FakeServer)
     assert photo.image_id == UUID(str(PHOTO["image_id"]))
     assert photo.upload_time.utcoffset() is not None
     assert photo.model_extra == {"storeys": 5}
-
-
-def test_every_post_has_a_key_without_an_argument(server: FakeServer) -> None:
-    for _ in range(2):
-        server.will_answer(202, STARTED)
-    with placewise.connect(server.url) as places:
-        places.evaluate()
-        places.fit_vocabulary()
-    keys = [headers.get("Idempotency-Key") for headers in server.headers]
-    assert None not in keys
-    assert len(set(keys)) == 2
 
 
 def test_photos_are_fetched_page_after_page_as_they_are_reached(server: FakeServer) -> None:

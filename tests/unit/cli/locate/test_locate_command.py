@@ -12,23 +12,24 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
+from urllib.parse import parse_qs, urlsplit
 from xml.etree import ElementTree
 
 import pytest
 from PIL import Image
-from PIL.ExifTags import GPS, IFD, Base
+from PIL.ExifTags import IFD, Base
 from typer.testing import CliRunner, Result
 
-from placewise.answers import Similar
 from services.cli.locate import command, preview, undo_journal, writers
-from services.cli.locate.folder import FolderPhoto, read_folder, read_gpx
+from services.cli.locate.folder import read_folder, read_gpx
 from services.cli.locate.sidecars import add_position, read_position
 from services.cli.main import build_app
 from shared.errors import InvalidRequest
 from shared.imaging.photo_header import read_photo_header
 from shared.ingest.photo_metadata import read_csv_manifest
-from tests.support.api_responses import PHOTO, SIMILAR
-from tests.support.photos import encoded, photo_image
+from tests.support.api_responses import PHOTO, SIMILAR, STATS
+from tests.support.fake_server import FakeServer
+from tests.support.photos import encoded, exif_with_position, photo_image
 
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
 LATITUDE, LONGITUDE = 45.0691, 7.6853
@@ -44,17 +45,14 @@ def photo(
 ) -> bytes:
     """A JPEG that was taken so many seconds after noon UTC; the camera's clock is two ahead."""
     exif = Image.Exif()
+    if north_m is not None:
+        exif = exif_with_position(LATITUDE + north_m * DEGREES_PER_M, LONGITUDE)
     exif[Base.Make], exif[Base.Model] = "Maker", camera
     if seconds is not None:
         clock = NOON + timedelta(hours=2, seconds=seconds)
         exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = f"{clock:%Y:%m:%d %H:%M:%S}"
         if offset:
             exif.get_ifd(IFD.Exif)[Base.OffsetTimeOriginal] = offset
-    if north_m is not None:
-        gps = exif.get_ifd(IFD.GPSInfo)
-        gps[GPS.GPSLatitudeRef], gps[GPS.GPSLongitudeRef] = "N", "E"
-        gps[GPS.GPSLatitude] = (LATITUDE + north_m * DEGREES_PER_M, 0.0, 0.0)
-        gps[GPS.GPSLongitude] = (LONGITUDE, 0.0, 0.0)
     return encoded(photo_image(1), "JPEG", exif=exif)
 
 
@@ -376,74 +374,53 @@ def test_a_name_in_a_table_is_no_formula_for_a_spreadsheet(folder: Path) -> None
     assert [entry.name for entry in read_csv_manifest(table, "table")] == ["=2.jpg"]
 
 
-def answer(**changes: Any) -> Similar:
+def answer(**changes: Any) -> dict[str, Any]:
     similar = {**PHOTO, "latitude": LATITUDE, "longitude": LONGITUDE, "similarity_score": 0.9}
     levels = [
         {"latitude": LATITUDE, "longitude": LONGITUDE, "radius_m": radius, "probability": 0.97}
         for radius in (25.0, 100.0)
     ]
     estimate = {"reason": "", "levels": levels, "not_in_map_probability": 0.01}
-    return Similar(**{**SIMILAR, "similar_images": [similar], "estimate": estimate, **changes})
+    return {**SIMILAR, "similar_images": [similar], "estimate": estimate, **changes}
 
 
-class ScriptedClient:
-    """Answers each search with the next answer, and remembers the filters."""
-
-    def __init__(self, *answers: Similar) -> None:
-        self.answers = list(answers)
-        self.boxes: list[str | None] = []
-
-    def similar(self, path: Path, top_k: int, history: bool, box: str | None = None) -> Similar:
-        assert not history
-        self.boxes.append(box)
-        return self.answers.pop(0)
+def will_find(server: FakeServer, *answers: dict[str, Any]) -> None:
+    """Answer the searches of one command."""
+    for each in ({**STATS, "searchable_images": 10}, *answers):
+        server.will_answer(200, each)
 
 
-def search(*answers: Similar) -> tuple[Any, list[str | None]]:
-    client = ScriptedClient(*answers)
-    photos = [FolderPhoto("a.jpg", None, False, None, None, None, Path("a.jpg"))]
-    found = command._search_photos(client, 1000, photos)  # type: ignore[arg-type]
-    return found[Path("a.jpg")].evidence, client.boxes
+def searched(server: FakeServer, *arguments: str | Path) -> Result:
+    return run(*arguments, "--server", server.url, picture=True)
 
 
-def test_a_photo_of_the_map_without_coordinates_does_not_hide_the_others() -> None:
+def searched_proposals(server: FakeServer, *arguments: str | Path) -> dict[str, dict[str, Any]]:
+    return proposals(*arguments, "--server", server.url, picture=True)
+
+
+def test_a_photo_of_the_map_without_coordinates_does_not_hide_the_others(
+    folder: Path, server: FakeServer
+) -> None:
+    (folder / "day 1" / "2.jpg").unlink()
     unlocated = {**PHOTO, "latitude": None, "longitude": None, "place": None}
     first = answer(similar_images=[{**unlocated, "similarity_score": 1.0}], matches_without_place=1)
-    evidence, boxes = search(first, answer())
-    assert boxes == [None, command.WITH_COORDINATES]
-    assert [circle.radius_m for circle in evidence.circles] == [25.0, 100.0]
-    assert evidence.similar[0].name == "Day 2/street.jpg"
-    assert search(answer())[1] == [None]
-
-
-def connect(monkeypatch: pytest.MonkeyPatch, response: Similar) -> None:
-    """Let a server answer every search so."""
-
-    class Connection:
-        def __enter__(self) -> Any:
-            return self
-
-        def __exit__(self, *error: object) -> None:
-            """Nothing to close."""
-
-        def stats(self) -> Any:
-            return type("Stats", (), {"searchable_images": 10})
-
-        def similar(self, path: Path, **options: object) -> Similar:
-            return response
-
-    monkeypatch.setattr(command, "connect", lambda *options: Connection())
+    will_find(server, first, answer())
+    found = searched_proposals(server, folder)["4.jpg"]["position"]
+    assert found["reason"] == "looks like Day 2/street.jpg"
+    _, first_search, second_search = (path for _, path, _ in server.requests)
+    assert "box" not in first_search
+    assert parse_qs(urlsplit(second_search).query)["box"] == ["-90,-180,90,180"]
 
 
 def test_what_a_preview_has_shown_is_written_although_the_map_answers_differently_since(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, server: FakeServer
 ) -> None:
-    connect(monkeypatch, answer())
-    shown = proposals(folder, picture=True)
+    will_find(server, answer(), answer())
+    shown = searched_proposals(server, folder)
     (folder / "new.jpg").write_bytes(photo(None))
     sure = [{"latitude": 44.0, "longitude": 7.0, "radius_m": 25.0, "probability": 1.0}]
-    connect(monkeypatch, answer(estimate={"reason": "", "levels": sure}))
-    written = run(folder, "--write", "csv", picture=True)
+    will_find(server, answer(estimate={"reason": "", "levels": sure}))
+    written = searched(server, folder, "--write", "csv")
     assert written.exit_code == 0, written.output
     assert "1 proposals are not as they were accepted then" in written.stderr
     assert written.stderr.rstrip().endswith(": new.jpg")
@@ -455,56 +432,55 @@ def test_what_a_preview_has_shown_is_written_although_the_map_answers_differentl
     assert coordinates.keys() == {"new.jpg"}
 
 
-def test_no_photo_of_a_preview_is_searched_again_unless_it_has_changed(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
+def test_no_photo_of_a_preview_is_searched_again_unless_it_has_changed_or_a_day_has_passed(
+    folder: Path, server: FakeServer
 ) -> None:
-    connect(monkeypatch, answer())
-    shown = run(folder, picture=True)
-    monkeypatch.setattr(command, "connect", None)
-    written = run(folder, "--write", "csv", picture=True)
+    will_find(server, answer(), answer())
+    shown = searched(server, folder)
+    requests = len(server.requests)
+    written = searched(server, folder, "--write", "csv")
     assert written.exit_code == 0, written.output
+    assert len(server.requests) == requests
     assert written.stdout == shown.stdout
     assert "All proposals are as they were then." in written.stderr
     (folder / "4.jpg").write_bytes(photo(26, camera="another"))
-    connect(monkeypatch, answer(estimate={"reason": "", "levels": []}))
-    written = run(folder, "--write", "csv", picture=True)
+    will_find(server, answer(estimate={"reason": "", "levels": []}))
+    written = searched(server, folder, "--write", "csv")
     assert written.stderr.rstrip().endswith(": 4.jpg")
     old = datetime.now(UTC) - preview.KEPT_FOR
     for file in (Path(os.environ["PLACEWISE_HOME"]) / "locate").iterdir():
         kept = preview.PREVIEW.validate_json(file.read_bytes())
         file.write_bytes(preview.PREVIEW.dump_json(replace(kept, searched_at=old)))
-    assert "The searches are those of" not in run(folder, "--write", "csv", picture=True).stderr
+    will_find(server, answer(), answer())
+    assert "The searches are those of" not in searched(server, folder, "--write", "csv").stderr
 
 
-def test_a_map_with_labels_only_gives_places(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_with_labels_only_gives_places(folder: Path, server: FakeServer) -> None:
     levels = [{"place": "tower/floor 7", "probability": 0.96}, {"place": "tower", "probability": 1}]
     unlocated = {**PHOTO, "latitude": None, "place": "tower/floor 7", "similarity_score": 0.9}
     by_label = answer(similar_images=[unlocated], estimate={"reason": "", "levels": levels})
-
-    connect(monkeypatch, by_label)
-    found = proposals(folder, picture=True)["4.jpg"]
+    will_find(server, by_label, by_label)
+    found = searched_proposals(server, folder)["4.jpg"]
     assert (found["place"], found["accepted"], found["position"]) == ("tower/floor 7", True, None)
-    result = run(folder, "--write", "gpx", picture=True)
+    result = searched(server, folder, "--write", "gpx")
     assert (result.exit_code, "--write csv" in result.stderr) == (1, True)
-    assert run(folder, "--write", "csv", picture=True).exit_code == 0
+    assert searched(server, folder, "--write", "csv").exit_code == 0
     assert "4.jpg,,,tower/floor 7" in (folder / "placewise-locations.csv").read_text()
 
 
 def test_a_place_that_is_not_probable_enough_is_not_written_with_the_position(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, server: FakeServer
 ) -> None:
     levels = [{"place": "tower/floor 7", "probability": 0.3}]
-    connect(monkeypatch, answer(estimate={"reason": "", "levels": levels}))
-    found = proposals(folder, picture=True)["day 1/2.jpg"]
-    assert (found["accepted"], found["place"], found["place_probability"]) == (
-        True,
-        "tower/floor 7",
-        0.3,
-    )
-    assert run(folder, "--write", "csv", picture=True).exit_code == 0
+    unsure = answer(estimate={"reason": "", "levels": levels})
+    will_find(server, unsure, unsure)
+    found = searched_proposals(server, folder)["day 1/2.jpg"]
+    place = (found["accepted"], found["place"], found["place_probability"])
+    assert place == (True, "tower/floor 7", 0.3)
+    assert searched(server, folder, "--write", "csv").exit_code == 0
     table = (folder / "placewise-locations.csv").read_bytes()
-    (entry,) = read_csv_manifest(table, "table")
-    assert entry.fields.keys() == {"latitude", "longitude"}
+    entries = {entry.name: entry.fields.keys() for entry in read_csv_manifest(table, "table")}
+    assert entries["day 1/2.jpg"] == {"latitude", "longitude"}
 
 
 @pytest.mark.parametrize("target", ["sidecar", "exif"])

@@ -1,18 +1,29 @@
-"""`placewise evaluate` on a live map: recall of its own photos and of its labelled queries."""
+"""`placewise evaluate` on a live map: recall of its own photos and of its labelled queries.
+
+The command of the lab, which replaces this one, adds data sets and predictions.
+"""
 
 from __future__ import annotations
 
 from itertools import islice
+from pathlib import Path
+from typing import Annotated
 from uuid import UUID
 
+import typer
 from rich.progress import Progress
 from rich.table import Column
 
 from placewise.answers import Evaluation
 from placewise.client import Client
 from services.cli.client import active_generation, connect, wait_for_job
+from services.cli.environment import lab_missing
 from services.cli.output import (
     Json,
+    JsonOption,
+    KeyOption,
+    MapOption,
+    ServerOption,
     Table,
     format_percent,
     print_json,
@@ -23,6 +34,41 @@ from services.cli.output import (
 from shared.errors import Conflict
 
 MAX_EVALUATIONS_SHOWN = 6  # the current evaluation and earlier ones
+
+SampleOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="Live map: number of photos to query with. Default: 1000."),
+]
+SeedOption = Annotated[int | None, typer.Option(min=0, help="Live map: random seed.")]
+WordWeightsOption = Annotated[
+    bool,
+    typer.Option(
+        "--word-weights",
+        help="Live map: first fit weights of visual words on the map's places, and keep them "
+        "if recall improves.",
+    ),
+]
+
+
+def evaluate(
+    data: Annotated[Path | None, typer.Option(hidden=True)] = None,
+    predictions: Annotated[Path | None, typer.Option(hidden=True)] = None,
+    sample: SampleOption = None,
+    seed: SeedOption = None,
+    word_weights: WordWeightsOption = False,
+    map_name: MapOption = None,
+    server: ServerOption = None,
+    key: KeyOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure retrieval recall in a live map.
+
+    Evaluates the map with its own photos (leave-one-out) and its labelled queries.
+    """
+    for option, value in (("--data", data), ("--predictions", predictions)):
+        if value is not None:
+            raise lab_missing(f"`evaluate {option}`")
+    evaluate_map(sample, seed, word_weights, map_name, server, key, as_json)
 
 
 def evaluate_map(
