@@ -21,7 +21,8 @@ from shared.telemetry.tracing import configure_tracing
 
 log = logging.getLogger(__name__)
 
-SCHEMA_WAIT_SECONDS = 60.0  # that a starting service gives the catalog and `placewise migrate`
+# That a starting service gives the catalog and `placewise storage migrate`.
+SCHEMA_WAIT_SECONDS = 60.0
 
 RunUntilStopped = Callable[[threading.Event], None]
 """Runs until the event is set."""

@@ -45,17 +45,12 @@ PANELS = {
         "extractor": "services.cli.operations.servers:extractor",
         "search": "services.cli.operations.servers:search",
         "steward": "services.cli.operations.servers:steward",
-        "migrate": "services.cli.operations.servers:migrate",
     },
     "Operation": {
         "config": "services.cli.environment:config",
         "doctor": "services.cli.operations.doctor:doctor",
         "keys": "services.cli.operations.keys:app",
         "storage": "services.cli.operations.storage:app",
-        "verify": "services.cli.operations.storage:verify",
-        "backup": "services.cli.operations.backup:backup",
-        "restore": "services.cli.operations.backup:restore",
-        "rebuild-catalog": "services.cli.operations.backup:rebuild_catalog",
     },
 }
 # The lab's commands exist where `lab` stands beside `services`: in a clone of the repository, but
@@ -69,6 +64,8 @@ LAB_COMMANDS = {
     "datasets": "lab.cli.datasets.commands:app",
     "bench": "lab.cli.bench:app",
 }
+# Subcommands of a group that are accepted without it: they are typed in a hurry.
+SHORT_COMMANDS = {"verify": "storage", "backup": "storage", "restore": "storage"}
 ROOT = Path(__file__).parents[2]
 
 
@@ -160,6 +157,8 @@ def run() -> None:
     logging.basicConfig(
         level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
     )
+    if sys.argv[1:] and sys.argv[1] in SHORT_COMMANDS:
+        sys.argv.insert(1, SHORT_COMMANDS[sys.argv[1]])
     names = sys.argv[1:2]
     if sys.argv[1:] in ([], ["--help"], ["--version"]):
         app = _build_overview()

@@ -107,7 +107,7 @@ def _check_schema(session: Session, about: BackupManifest) -> None:
 
 
 def _check_catalog_empty(session: Session) -> None:
-    """Raise Conflict unless the catalog is as after `placewise migrate` or a first start."""
+    """Raise Conflict unless the catalog is as after `storage migrate` or a first start."""
     for table in backup_tables():
         if table.name in (*NOT_RESTORED_TABLES, Map.__tablename__):
             continue

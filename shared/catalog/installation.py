@@ -42,7 +42,7 @@ class Installation(Base):
     # Endpoint and name of the bucket with the objects; null if they are in a folder.
     bucket: Mapped[BucketLocation | None] = mapped_column(JsonValue)
     # Number of the last journal segment that this catalog has written (`shared.journal`), or
-    # REBUILDING until `placewise rebuild-catalog` has finished.
+    # REBUILDING until `placewise storage rebuild` has finished.
     journal_sequence: Mapped[int] = mapped_column(BigInteger, default=0, server_default="0")
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
 

@@ -55,7 +55,7 @@ class Lag:
         """Message for the operator: what happened and what to do."""
         if self.since is None:
             return (
-                "`placewise rebuild-catalog` was interrupted. Run it again to resume it. Until "
+                "`placewise storage rebuild` was interrupted. Run it again to resume it. Until "
                 "then, nothing is deleted from the object store."
             )
         return (

@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 RECOVERY_ADVICE = (
     "Restore the catalog (the file itself, or `placewise restore` into an empty one) or correct "
-    "DATABASE_URL; rebuild the catalog from the objects: placewise rebuild-catalog; or make this "
+    "DATABASE_URL; rebuild the catalog from the objects: placewise storage rebuild; or make this "
     "catalog, which does not know those objects, the owner: placewise storage adopt."
 )
 

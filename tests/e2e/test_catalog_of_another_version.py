@@ -34,7 +34,7 @@ def test_a_catalog_of_another_version_is_refused_by_name_and_rebuilt_from_its_st
     assert "schema_differs" in refused.stderr
     assert "schema 0029;" in refused.stderr
     assert f"move {home / 'catalog.sqlite'} (and its -wal and -shm files) away" in refused.stderr
-    assert "placewise rebuild-catalog" in refused.stderr
+    assert "placewise storage rebuild" in refused.stderr
     assert "Traceback" not in refused.stderr
     assert hashes(home) == before
 
@@ -42,7 +42,7 @@ def test_a_catalog_of_another_version_is_refused_by_name_and_rebuilt_from_its_st
     aside.mkdir()
     for file in home.glob("catalog.sqlite*"):
         shutil.move(file, aside)
-    rebuilt = run_command("rebuild-catalog", env=environment(home), cwd=tmp_path)
+    rebuilt = run_command("storage", "rebuild", env=environment(home), cwd=tmp_path)
     assert rebuilt.returncode == 0, rebuilt.stderr
     with ServerProcess(home) as server:
         for name, count in (("default", 5), ("city", 3)):

@@ -40,7 +40,7 @@ class Deployment:
 
     def migrate(self) -> None:
         env = environment(self.home, **self.settings)
-        migrated = run_command("migrate", env=env, cwd=self.root)
+        migrated = run_command("storage", "migrate", env=env, cwd=self.root)
         assert migrated.returncode == 0, migrated.stderr
 
     def start(self, service: str, crashing: str | None = None, **settings: Any) -> Process:

@@ -71,7 +71,7 @@ class Filled:
         done = self.command(*arguments, **more)
         assert done.returncode == 1, done.stderr
         assert "folder_taken" in done.stderr or "bucket_taken" in done.stderr
-        assert "placewise rebuild-catalog" in done.stderr
+        assert "placewise storage rebuild" in done.stderr
         assert "placewise storage adopt" in done.stderr
 
 

@@ -73,7 +73,7 @@ def test_removed_and_older_catalogs_lose_nothing(tmp_path: Path) -> None:
         # The catalog is gone.
         for file in catalog_files(home):
             file.unlink()
-        taken = run(home, "rebuild-catalog")
+        taken = run(home, "storage", "rebuild")
         assert (taken["photos"], taken["descriptors"], taken["queued_photos"]) == (3, 3, 0)
         server.start()
         assert {file_id: said_of(server, file_id) for file_id in retained} == fields
@@ -82,7 +82,7 @@ def test_removed_and_older_catalogs_lose_nothing(tmp_path: Path) -> None:
         assert run(home, "verify", "--originals")["faults"] == []
         server.stop()
         assert objects(home, "originals/") == originals
-        assert run(home, "rebuild-catalog", code=1)["code"] == "catalog_not_empty"
+        assert run(home, "storage", "rebuild", code=1)["code"] == "catalog_not_empty"
 
     # An older catalog is there.
     for file in catalog_files(home):

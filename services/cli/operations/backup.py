@@ -1,6 +1,6 @@
-"""`placewise backup`, `restore` and `rebuild-catalog`.
+"""`placewise storage backup`, `restore` and `rebuild`.
 
-A backup is a folder with the catalog's rows and the objects that they refer to. `rebuild-catalog`
+A backup is a folder with the catalog's rows and the objects that they refer to. `rebuild`
 recovers a lost catalog from the object store alone. `maintenance` does the work; it is imported
 when a command runs.
 """

@@ -135,7 +135,7 @@ def rebuild(settings: Settings, progress: BackupProgress) -> RecoveryReport:
         if exclusive:
             stack.enter_context(lock_home(settings.placewise_home))
         catalog = stack.enter_context(
-            contextlib.closing(open_catalog(settings, "rebuild-catalog", NO_TIMEOUTS))
+            contextlib.closing(open_catalog(settings, "rebuild", NO_TIMEOUTS))
         )
         migrate(catalog)
         begin_rebuild(catalog, open_store(settings, exclusive=exclusive))

@@ -1,4 +1,4 @@
-"""Commands that run servers: `serve`, `gateway`, `extractor`, `search`, `steward`, and `migrate`.
+"""Commands that run servers: `serve`, `gateway`, `extractor`, `search` and `steward`.
 
 `serve` runs the embedded Placewise in one process. The others run one service each; services share
 DATABASE_URL (PostgreSQL), REDIS_URL, the object store and SEARCH_URLS. Each command imports its
@@ -281,15 +281,3 @@ def steward() -> None:
         from services.steward.service import serve_steward
 
     serve_steward(read_settings(), print_note)
-
-
-def migrate() -> None:
-    """Create the catalog's tables in an empty database (DATABASE_URL).
-
-    Run it before the services start. It changes nothing where they exist, and refuses the tables of
-    another version.
-    """
-    from services.service_process import migrate_catalog
-
-    installation_id = migrate_catalog(read_settings())
-    print_note(f"The catalog has its tables (installation {installation_id})")

@@ -1,7 +1,7 @@
-"""`placewise verify` and `placewise storage`: integrity checks and object store maintenance.
+"""`placewise storage`: the catalog and the object store.
 
-`verify` checks every chunk against its hash and the catalog. `storage` creates the bucket, assigns
-the store to a catalog, and manages orphaned objects and the trash.
+`verify` checks every chunk against its hash and the catalog. Other subcommands create tables and
+the bucket, assign the store to a catalog, and manage orphaned objects and the trash.
 """
 
 from __future__ import annotations
@@ -13,7 +13,13 @@ import typer
 from rich.markup import escape
 
 from services.cli.environment import read_settings
-from services.cli.operations.backup import print_taken_in, progress_reporter
+from services.cli.operations.backup import (
+    backup,
+    print_taken_in,
+    progress_reporter,
+    rebuild_catalog,
+    restore,
+)
 from services.cli.output import (
     JsonOption,
     console,
@@ -130,8 +136,29 @@ def _print_report(report: IntegrityReport, queued: int | None) -> None:
 
 
 app = typer.Typer(
-    help="Manage the object store: bucket, owner, orphans and trash.", no_args_is_help=True
+    help="Verify, back up, restore and rebuild what is stored; manage the bucket, its owner, "
+    "orphans and trash. `verify`, `backup` and `restore` also work without `storage`.",
+    no_args_is_help=True,
 )
+
+
+def migrate() -> None:
+    """Create the catalog's tables in an empty database (DATABASE_URL).
+
+    Run it before the services start. It changes nothing where they exist, and refuses the tables of
+    another version.
+    """
+    from services.service_process import migrate_catalog
+
+    installation_id = migrate_catalog(read_settings())
+    print_note(f"The catalog has its tables (installation {installation_id})")
+
+
+app.command("verify")(verify)
+app.command("backup")(backup)
+app.command("restore")(restore)
+app.command("rebuild")(rebuild_catalog)
+app.command("migrate")(migrate)
 
 ConfirmOption = Annotated[
     bool, typer.Option("--confirm", help="Apply the change. Without it, the command only reports.")
@@ -211,7 +238,7 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
 
 
 @app.command("restore-trash")
-def restore(
+def restore_trash(
     prefix: Annotated[
         str,
         typer.Option(
@@ -223,7 +250,7 @@ def restore(
     """Move objects from the trash back to their keys while services run.
 
     This does not add them to the catalog: they are orphans again and are kept for another
-    ORPHAN_AGE_SECONDS. `placewise verify --repair` recovers originals; `placewise rebuild-catalog`
+    ORPHAN_AGE_SECONDS. `placewise verify --repair` recovers originals; `placewise storage rebuild`
     rebuilds a catalog from all objects.
     """
     from services.cli.operations.maintenance import restore_from_trash

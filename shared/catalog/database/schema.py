@@ -1,8 +1,9 @@
 """Creation of the catalog's tables, and the check that they are those of this version.
 
-`placewise migrate` creates them before the services start; the embedded Placewise does at startup.
+`placewise storage migrate` creates them before the services start; the embedded Placewise does at
+startup.
 Services only check them (`wait_for_schema`). Versions before the first release do not read each
-other's catalogs: a catalog of another one is refused, and `placewise rebuild-catalog` creates a new
+other's catalogs: a catalog of another one is refused, and `placewise storage rebuild` creates a new
 one from the object store.
 
 Errors of an SQLite file while a process starts name the file, the cause and the remedies
@@ -78,7 +79,7 @@ def check_schema(catalog: Catalog) -> None:
     with catalog.read() as session:
         if not _is_current(catalog, session.connection()):
             raise Misconfigured(
-                "schema_missing", "The catalog has no tables. Run `placewise migrate` once."
+                "schema_missing", "The catalog has no tables. Run `placewise storage migrate` once."
             )
 
 
@@ -136,7 +137,7 @@ def _is_current(catalog: Catalog, connection: Connection) -> bool:
         return True
     file = sqlite_file(catalog)
     remedy = (
-        "let DATABASE_URL name an empty database, run `placewise migrate`"
+        "let DATABASE_URL name an empty database, run `placewise storage migrate`"
         if file is None
         else f"move {file} (and its -wal and -shm files) away without deleting it"
     )
@@ -145,7 +146,7 @@ def _is_current(catalog: Catalog, connection: Connection) -> bool:
         f"The catalog was created by another version of Placewise (schema {present}; this version "
         f"has {schema_revision()}), and versions before the first release do not read each other's "
         "catalogs. Nothing was changed. Start that version again; or create a new catalog from the "
-        f"object store, which stays as it is: {remedy}, and run `placewise rebuild-catalog`.",
+        f"object store, which stays as it is: {remedy}, and run `placewise storage rebuild`.",
         present=present,
         needed=schema_revision(),
     )
@@ -201,7 +202,7 @@ MAX_CHECKED_BYTES = 256_000_000
 REMEDIES = (
     "Move it and its -wal and -shm files away without deleting them, then restore a backup "
     "(placewise restore FOLDER, into an empty PLACEWISE_HOME) or create a new catalog from the "
-    "object store (placewise rebuild-catalog)."
+    "object store (placewise storage rebuild)."
 )
 
 

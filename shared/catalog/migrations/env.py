@@ -7,8 +7,8 @@ from alembic import context
 connection = context.config.attributes.get("connection")
 if connection is None:
     raise SystemExit(
-        "Run migrations with `placewise migrate`, which passes Alembic its connection, not with "
-        "the alembic command."
+        "Run migrations with `placewise storage migrate`, which passes Alembic its connection, not "
+        "with the alembic command."
     )
 context.configure(connection=connection)
 with context.begin_transaction():

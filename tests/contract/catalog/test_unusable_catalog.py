@@ -79,7 +79,7 @@ def make_folder(file: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "code", "says"),
     [
-        (damage_pages, "catalog_damaged", "placewise rebuild-catalog"),
+        (damage_pages, "catalog_damaged", "placewise storage rebuild"),
         (damage_last_page, "catalog_damaged", "placewise restore FOLDER"),
         (truncate, "catalog_damaged", "placewise restore FOLDER"),
         (no_sqlite, "catalog_damaged", "file is not a database"),
@@ -137,7 +137,7 @@ def test_a_command_on_a_damaged_catalog_ends_with_a_sentence(file: Path, command
     output = done.stdout + done.stderr
     assert done.returncode == 1
     assert str(file) in output
-    assert "placewise rebuild-catalog" in output
+    assert "placewise storage rebuild" in output
     assert "Traceback" not in output
 
 

@@ -223,7 +223,7 @@ def test_store_of_another_catalog_is_refused_and_the_ways_out_are_named(
     with pytest.raises(Misconfigured) as caught:
         open_installation_store(other_catalog, used, exclusive=False)
     assert caught.value.code in TAKEN
-    for way in ("Restore the catalog", "placewise rebuild-catalog", "placewise storage adopt"):
+    for way in ("Restore the catalog", "placewise storage rebuild", "placewise storage adopt"):
         assert way in caught.value.detail
     assert open_installation_store(catalog, used, exclusive=False).get("originals/a") == b"x"
 

@@ -73,7 +73,8 @@ def test_each_draws_numbers_of_its_own(tmp_path: Path) -> None:
     """A fork begins with its parent's random state, too."""
     drawn = []
     for number in range(3):
-        ended = run_command("migrate", env=environment(tmp_path / str(number)), cwd=tmp_path)
+        env = environment(tmp_path / str(number))
+        ended = run_command("storage", "migrate", env=env, cwd=tmp_path)
         assert ended.returncode == 0, ended.stderr
         made = re.search(r"installation\s+([0-9a-f-]{36})", ended.stderr)
         assert made, ended.stderr

@@ -176,7 +176,7 @@ def test_a_rebuild_that_was_killed_goes_on_and_a_full_catalog_is_refused(
                 rebuilt(service)
         lag = catalog_lag(service.catalog, store)
         assert lag is not None
-        assert "rebuild-catalog" in lag.detail
+        assert "storage rebuild" in lag.detail
         with contextlib.suppress(CollectionHeld):
             assert collect_orphans(service.catalog, store, -1.0) == 0
         assert write_journal(service.catalog, store).lines == 0

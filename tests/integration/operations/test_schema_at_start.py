@@ -54,7 +54,7 @@ def test_a_migration_that_does_not_end_is_waited_for_only_so_long(
 
 
 def test_service_waits_for_the_migration_and_then_starts(catalog: Catalog) -> None:
-    with pytest.raises(Misconfigured, match="placewise migrate") as caught:
+    with pytest.raises(Misconfigured, match="placewise storage migrate") as caught:
         wait_for_schema(catalog, 0.1)
     assert caught.value.code == "schema_missing"
     waiting = threading.Thread(target=wait_for_schema, args=(catalog, 60))

@@ -54,8 +54,8 @@ def test_options_and_commands_are_accepted_with_hyphens_and_underscores(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     program: Any = typer.main.get_command(build_app())
-    program.main(["rebuild_catalog", "--help"], standalone_mode=False)
-    assert "rebuild-catalog" in capsys.readouterr().out
+    program.main(["storage", "create_bucket", "--help"], standalone_mode=False)
+    assert "create-bucket" in capsys.readouterr().out
     for option in ("--top-k", "--top_k"):
         with pytest.raises(SystemExit, match="2"):
             program.main(["query", __file__, option, "many"])
