@@ -187,13 +187,14 @@ def import_checkpoint(context: ExtractorContext, job: Job) -> None:
     ).check()
     data = encode_model_file(checkpoint)
     sha256 = hashlib.sha256(data).hexdigest()
+    key = new_model_key(sha256)
     new = Model(
         id=new_id(),
         name=f"{TRAINED_MODEL_PREFIX}{name}",
         added_name=name,
         added_at=db_now(),
         fingerprint=checkpoint.fingerprint,
-        object_key=new_model_key(sha256),
+        object_key=key,
         sha256=sha256,
         size_bytes=len(data),
         dimension=checkpoint.model.dimension,
@@ -202,7 +203,7 @@ def import_checkpoint(context: ExtractorContext, job: Job) -> None:
         note=job.params["note"],
         card=card,
     )
-    context.store.put(new.object_key, data)
+    context.store.put(key, data)
     with context.catalog.write() as session:
         if leased := lock_leased_job(session, job):
             model, added = register_model(session, new)
