@@ -8,9 +8,9 @@ training photos, so that no place of the evaluation is in the training set.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
@@ -129,28 +129,28 @@ def make_plan(options: CityOptions) -> CityPlan:
         quarter, view_points = make_quarter(options.seed, name, place_count, origin)
         quarters[name], places[name] = quarter, view_points
         origin = (quarter.far_east + QUARTER_DISTANCE_M, origin[1])
-    photos = _database_photos(options, places["map"])
+    photos = [*_database_photos(options, places["map"])]
     rng = random_stream(options.seed, "queries")
     other_way = round(inside * OTHER_WAY_SHARE)
     order = np.resize(rng.permutation(len(places["map"])), inside)
     for number in range(options.queries):
         if number < inside:
             kind = "other_way" if number < other_way else "in_map"
-            place, quarter_name = places["map"][int(order[number])], "map"
+            place = places["map"][int(order[number])]
         else:
-            kind, quarter_name = "out_of_map", "outskirts"
+            kind = "out_of_map"
             place = places["outskirts"][(number - inside) % len(places["outskirts"])]
-        photos.append(_query_photo(options, place, quarter_name, kind, number))
-    photos += _ride_photos(options, places["map"], places["outskirts"])
+        photos.append(_query_photo(options, place, kind, number))
+    if options.ride_frames:
+        photos += _ride_photos(options, places["map"], places["outskirts"])
     if options.train:
         photos += _train_photos(options, places["school"])
     photos.sort(key=lambda photo: (photo.quarter, photo.place, photo.role, photo.number))
     return CityPlan(options, quarters, photos)
 
 
-def _database_photos(options: CityOptions, places: list[ViewPoint]) -> list[PlannedPhoto]:
+def _database_photos(options: CityOptions, places: list[ViewPoint]) -> Iterator[PlannedPhoto]:
     """Plan `views` photos of each place, in alternating sessions, shifted and rotated slightly."""
-    photos = []
     steps = math.ceil(options.views / len(DATABASE_SESSIONS))
     for place in places:
         for view in range(options.views):
@@ -168,15 +168,10 @@ def _database_photos(options: CityOptions, places: list[ViewPoint]) -> list[Plan
                 rng=rng,
             )
             number = place.number * options.views + view
-            photos.append(
-                _plan_photo(options, "database", "in_map", "map", place, camera, session, number)
-            )
-    return photos
+            yield _plan_photo(options, "database", "in_map", place, camera, session, number)
 
 
-def _query_photo(
-    options: CityOptions, place: ViewPoint, quarter: str, kind: str, number: int
-) -> PlannedPhoto:
+def _query_photo(options: CityOptions, place: ViewPoint, kind: str, number: int) -> PlannedPhoto:
     rng = random_stream(options.seed, "query", number)
     camera = _camera(
         options,
@@ -188,17 +183,14 @@ def _query_photo(
         rng=rng,
     )
     session = QUERY_SESSIONS[int(rng.integers(len(QUERY_SESSIONS)))]
-    return _plan_photo(options, "query", kind, quarter, place, camera, session, number)
+    return _plan_photo(options, "query", kind, place, camera, session, number)
 
 
 def _ride_photos(
     options: CityOptions, places: list[ViewPoint], outskirts: list[ViewPoint]
-) -> list[PlannedPhoto]:
+) -> Iterator[PlannedPhoto]:
     """Plan the same ride in each of RIDE_SESSIONS, with another camera each time."""
-    if not options.ride_frames:
-        return []
     frames = plan_ride(random_stream(options.seed, "ride"), places, outskirts, options.ride_frames)
-    photos = []
     for session in RIDE_SESSIONS:
         fov = random_stream(options.seed, "ride", session.name).uniform(*QUERY_FOV)
         for number, frame in enumerate(frames):
@@ -212,16 +204,12 @@ def _ride_photos(
                 fov=fov,
                 rng=rng,
             )
-            kind, quarter = ("in_map", "map") if frame.is_in_map else ("out_of_map", "outskirts")
-            photos.append(
-                _plan_photo(options, "ride", kind, quarter, frame.place, camera, session, number)
-            )
-    return photos
+            kind = "in_map" if frame.is_in_map else "out_of_map"
+            yield _plan_photo(options, "ride", kind, frame.place, camera, session, number)
 
 
-def _train_photos(options: CityOptions, places: list[ViewPoint]) -> list[PlannedPhoto]:
+def _train_photos(options: CityOptions, places: list[ViewPoint]) -> Iterator[PlannedPhoto]:
     """Plan at least four photos of each training place, each in a different session."""
-    photos = []
     views = min(max(4, options.views), len(SESSIONS))
     for place in places:
         order = random_stream(options.seed, "train", place.number).permutation(len(SESSIONS))
@@ -236,12 +224,8 @@ def _train_photos(options: CityOptions, places: list[ViewPoint]) -> list[Planned
                 fov=rng.uniform(*QUERY_FOV),
                 rng=rng,
             )
-            number = place.number * views + view
-            session = SESSIONS[int(order[view])]
-            photos.append(
-                _plan_photo(options, "train", "in_map", "school", place, camera, session, number)
-            )
-    return photos
+            number, session = place.number * views + view, SESSIONS[int(order[view])]
+            yield _plan_photo(options, "train", "in_map", place, camera, session, number)
 
 
 def _camera(
@@ -261,15 +245,18 @@ def _camera(
     street = place.street
     position = street.start + street.direction * (place.along + along)
     position = position + street.left * (across - LANE_M)
+    eye = rng.uniform(1.55, 2.3)
+    above = float(np.clip(rng.normal(0.12, 0.025), 0.05, 0.20)) * options.height
+    focal = options.width / 2 / math.tan(math.radians(fov) / 2)
     return Camera(
         x=round(float(position[0]), 2),
         y=round(float(position[1]), 2),
         yaw=round((place.yaw + yaw) % 360, 2),
         fov=fov,
-        eye=rng.uniform(1.55, 2.3),
+        eye=eye,
         width=options.width,
         height=options.height,
-        horizon=float(np.clip(rng.normal(0.62, 0.025), 0.55, 0.70)),
+        pitch=math.degrees(math.atan(above / focal)),
         roll=rng.normal(0, 0.8),
     )
 
@@ -278,17 +265,19 @@ def _plan_photo(
     options: CityOptions,
     role: str,
     kind: str,
-    quarter: str,
     place: ViewPoint,
     camera: Camera,
     session: CaptureSession,
     number: int,
 ) -> PlannedPhoto:
     city = city_name(options)
+    quarter = "school" if role == "train" else "outskirts" if kind == "out_of_map" else "map"
     folders = {"database": "database", "query": "queries", "ride": f"rides/{session.name}"}
     folder = folders.get(role, f"gsv_xs/train/{city}")
     # gsv_xs stores the place in the note; other photos store the session's name there.
     note = f"{place.number:05d}_{city}" if role == "train" else session.name
+    # The photos of a session follow each other within its day, those of a ride every second.
+    seconds = number if role == "ride" else SECONDS_PER_PHOTO * (number % 2000)
     name = UtmFileName(
         east=camera.x,
         north=camera.y,
@@ -296,14 +285,7 @@ def _plan_photo(
         zone_letter=ZONE_LETTER,
         pano_id=f"{quarter}{place.number:05d}-{session.name}-{number:06d}",
         heading=camera.yaw,
-        captured_at=session.starts_at + timedelta(seconds=number)
-        if role == "ride"
-        else _capture_time(session, number),
+        captured_at=session.starts_at + timedelta(seconds=seconds),
         note=note,
     ).file_name()
     return PlannedPhoto(role, kind, quarter, place.number, camera, session, number, folder, name)
-
-
-def _capture_time(session: CaptureSession, number: int) -> datetime:
-    """Return the time of a photo: they follow each other within the session's day."""
-    return session.starts_at + timedelta(seconds=SECONDS_PER_PHOTO * (number % 2000))

@@ -13,7 +13,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.city.houses import House, arrange_house
 from lab.city.textures import random_stream
 
 SPACING_M = (88.0, 132.0)
@@ -82,7 +81,6 @@ class Quarter:
         self._along = rng.choice(HALF_WIDTHS_M, count)  # streets that run east
         self.streets = self._lay_streets(rng, count)
         self.sides = self._build_blocks(rng, count)
-        self._houses: dict[tuple[int, int], House] = {}
 
     @property
     def far_east(self) -> float:
@@ -160,15 +158,6 @@ class Quarter:
     def side_lengths(self) -> Metres:
         """(sides,) lengths of the facade rows."""
         return np.array([side.length for side in self.sides])
-
-    def house(self, side: int, plot: int) -> House:
-        """Return the house on a plot; created on first access, independently of the order."""
-        if (side, plot) not in self._houses:
-            row = self.sides[side]
-            width = float(row.cuts[plot + 1] - row.cuts[plot])
-            rng = random_stream(self.seed, self.name, "house", side, plot)
-            self._houses[side, plot] = arrange_house(rng, width, row.shopping, row.floors)
-        return self._houses[side, plot]
 
 
 def _inset(corners: list[Metres], insets: list[float]) -> list[Metres]:

@@ -11,7 +11,7 @@ import multiprocessing
 import os
 import signal
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, replace
 from enum import StrEnum
@@ -20,11 +20,9 @@ from typing import Any
 
 import utm
 
-from lab.city.camera import TextureCache
-from lab.city.catalogue import make_catalogue
+from lab.city.light import encode_jpeg, take_photo
 from lab.city.plan import ZONE_LETTER, ZONE_NUMBER, CityPlan, PlannedPhoto, city_name
-from lab.city.postprocess import SkyAndGrain, encode_jpeg, postprocess
-from lab.city.render import QuarterRenderer
+from lab.city.scene import CityStyle, Scene
 from lab.city.textures import random_stream
 from shared.errors import Conflict, Misconfigured
 
@@ -59,23 +57,23 @@ def _write_training_table(plan: CityPlan, out: Path) -> None:
     """Write the CSV table of the training photos, in the layout of their folder."""
     city = city_name(plan.options)
     train = sorted((s for s in plan.photos if s.role == "train"), key=lambda photo: photo.number)
-    if not train or train[0].folder.startswith(TrainingLayoutName.GSV_XS):
-        path = out / TrainingLayoutName.GSV_XS / "dataframes" / f"{city}.csv"
-        _write(path, GSV_XS_COLUMNS, _gsv_xs_rows(city, train))
-    else:
+    columns: tuple[str, ...] = GSV_XS_COLUMNS
+    path = out / TrainingLayoutName.GSV_XS / "dataframes" / f"{city}.csv"
+    rows: list[tuple[object, ...]] = [
+        (photo.place, city, f"{photo.camera.x:.2f}", f"{photo.camera.y:.2f}", photo.name)
+        for photo in train
+    ]
+    if train and not train[0].folder.startswith(TrainingLayoutName.GSV_XS):
+        columns = GSV_CITIES_COLUMNS
         path = out / TrainingLayoutName.GSV_CITIES / "Dataframes" / f"{city}.csv"
-        _write(path, GSV_CITIES_COLUMNS, _gsv_cities_rows(plan, train))
-
-
-def _gsv_xs_rows(city: str, train: Sequence[PlannedPhoto]) -> Iterator[tuple[object, ...]]:
-    for photo in train:
-        yield photo.place, city, f"{photo.camera.x:.2f}", f"{photo.camera.y:.2f}", photo.name
-
-
-def _gsv_cities_rows(plan: CityPlan, train: Sequence[PlannedPhoto]) -> Iterator[tuple[object, ...]]:
-    for photo in train:
-        city, _, year, month, heading, *rest = _gsv_cities_fields(plan, photo)
-        yield photo.place, int(year), int(month), int(heading), city, *rest
+        fields = [_gsv_cities_fields(plan, photo) for photo in train]
+        rows = [
+            (photo.place, int(year), int(month), int(heading), city, *rest)
+            for photo, (_, _, year, month, heading, *rest) in zip(train, fields, strict=True)
+        ]
+    path.parent.mkdir(parents=True)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows([columns, *rows])
 
 
 def _gsv_cities_fields(plan: CityPlan, photo: PlannedPhoto) -> tuple[str, ...]:
@@ -91,14 +89,6 @@ def _gsv_cities_fields(plan: CityPlan, photo: PlannedPhoto) -> tuple[str, ...]:
         f"{float(longitude):.6f}",
         f"{photo.quarter}{photo.place:05d}-{photo.session.name}-{photo.number:06d}",
     )
-
-
-def _write(path: Path, columns: Sequence[str], rows: Iterator[tuple[object, ...]]) -> None:
-    path.parent.mkdir(parents=True)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(rows)
 
 
 PHOTOS_PER_TASK = 160
@@ -143,24 +133,21 @@ def write_city(
 
 
 def _render_all(plan: CityPlan, out: Path, on_progress: Callable[[int], None]) -> None:
-    tasks = [
-        (start, start + PHOTOS_PER_TASK) for start in range(0, len(plan.photos), PHOTOS_PER_TASK)
-    ]
-    workers = min(len(tasks), os.cpu_count() or 1, MAX_WORKERS)
+    starts = range(0, len(plan.photos), PHOTOS_PER_TASK)
+    workers = min(len(starts), os.cpu_count() or 1, MAX_WORKERS)
     if workers <= 1:  # no process pool needed
-        worker = _RenderWorker(plan, out)
-        for task in tasks:
-            on_progress(worker.render(*task))
+        renderer = PhotoRenderer(plan)
+        for start in starts:
+            on_progress(renderer.write(out, start, start + PHOTOS_PER_TASK))
         return
     # Spawned, not forked: forking a parent with threads can deadlock.
-    with ProcessPoolExecutor(
-        workers,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_start_render_worker,
-        initargs=(plan, out),
-    ) as pool:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, context, _start_process, (plan,)) as pool:
         try:
-            for done in as_completed([pool.submit(_render, *task) for task in tasks]):
+            tasks = [
+                pool.submit(_write_photos, out, start, start + PHOTOS_PER_TASK) for start in starts
+            ]
+            for done in as_completed(tasks):
                 on_progress(done.result())
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
@@ -179,7 +166,7 @@ def describe_city(plan: CityPlan) -> dict[str, Any]:
         "query_kinds": dict(sorted(Counter(photo.kind for photo in queries).items())),
         "sessions": {
             role: dict(
-                sorted(Counter(s.session.name for s in plan.photos if s.role == role).items())
+                sorted(Counter(p.session.name for p in plan.photos if p.role == role).items())
             )
             for role in ("database", "query", "ride", "train")
         },
@@ -190,48 +177,39 @@ def describe_city(plan: CityPlan) -> dict[str, Any]:
     }
 
 
-class _RenderWorker:
-    """State of a rendering process: catalogue, sky and grain, texture cache."""
+class PhotoRenderer:
+    """Renders the photos of a plan; each process has one, with its textures."""
 
-    def __init__(self, plan: CityPlan, out: Path) -> None:
+    def __init__(self, plan: CityPlan) -> None:
+        style = CityStyle(plan.options.catalogue_seed)
         self.plan = plan
-        self.out = out
-        self.catalogue = make_catalogue(plan.options.catalogue_seed)
-        self.sky_and_grain = SkyAndGrain.generate(
-            plan.options.catalogue_seed, plan.options.width, plan.options.height
-        )
-        cache = TextureCache()
-        self.renderers = {
-            name: QuarterRenderer(quarter, self.catalogue, cache)
-            for name, quarter in plan.quarters.items()
-        }
+        self._scenes = {name: Scene(quarter, style) for name, quarter in plan.quarters.items()}
 
-    def render(self, start: int, stop: int) -> int:
+    def render(self, photo: PlannedPhoto) -> bytes:
+        """Render one photo to JPEG bytes."""
+        scene, session = self._scenes[photo.quarter], photo.session
+        rng = random_stream(self.plan.options.seed, "photo", photo.role, photo.number)
+        canvas = scene.view(photo.camera, session)
+        return encode_jpeg(take_photo(canvas, session, scene.lamps(photo.camera), rng), session)
+
+    def write(self, out: Path, start: int, stop: int) -> int:
         """Render and write the photos [start, stop) of the plan; return their number."""
         photos = self.plan.photos[start:stop]
         for photo in photos:
-            photo.path(self.out).write_bytes(self.render_photo(photo))
+            photo.path(out).write_bytes(self.render(photo))
         return len(photos)
 
-    def render_photo(self, photo: PlannedPhoto) -> bytes:
-        """Render one photo to JPEG bytes."""
-        view = self.renderers[photo.quarter].view(photo.camera, photo.session)
-        rng = random_stream(self.plan.options.seed, "photo", photo.role, photo.number)
-        return encode_jpeg(
-            postprocess(view, photo.camera, photo.session, self.sky_and_grain, rng), photo.session
-        )
+
+_renderer: PhotoRenderer | None = None  # of this process
 
 
-_render_worker: _RenderWorker | None = None  # of this process
-
-
-def _start_render_worker(plan: CityPlan, out: Path) -> None:
-    global _render_worker
+def _start_process(plan: CityPlan) -> None:
+    global _renderer
     # The parent handles Ctrl-C and shuts down the pool; workers print no traceback.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _render_worker = _RenderWorker(plan, out)
+    _renderer = PhotoRenderer(plan)
 
 
-def _render(start: int, stop: int) -> int:
-    assert _render_worker is not None
-    return _render_worker.render(start, stop)
+def _write_photos(out: Path, start: int, stop: int) -> int:
+    assert _renderer is not None
+    return _renderer.write(out, start, stop)

@@ -9,16 +9,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from lab.city.camera import (
-    SUPERSAMPLING,
-    Camera,
-    RenderBuffers,
-    TextureCache,
-    cast_rays,
-)
-from lab.city.catalogue import Catalogue, make_catalogue
+from lab.city.camera import Camera, cast_rays
 from lab.city.plan import CityOptions, CityPlan, PlannedPhoto, make_plan
-from lab.city.render import QuarterRenderer
+from lab.city.raster import SUPERSAMPLING
+from lab.city.scene import CityStyle, Scene
 from lab.city.sessions import NIGHT, SESSIONS, SUMMER
 from lab.city.streets import Quarter
 
@@ -33,13 +27,8 @@ def plan() -> CityPlan:
 
 
 @pytest.fixture(scope="module")
-def catalogue() -> Catalogue:
-    return make_catalogue(1)
-
-
-@pytest.fixture(scope="module")
-def painter(plan: CityPlan, catalogue: Catalogue) -> QuarterRenderer:
-    return QuarterRenderer(plan.quarters["map"], catalogue, TextureCache())
+def scene(plan: CityPlan) -> Scene:
+    return Scene(plan.quarters["map"], CityStyle(1))
 
 
 def of_role(plan: CityPlan, role: str) -> list[PlannedPhoto]:
@@ -55,150 +44,126 @@ def facing(quarter: Quarter, side: int, distance: float) -> Camera:
     return Camera(float(spot[0]), float(spot[1]), yaw, fov=70, width=160, height=120)
 
 
-def moved_right(camera: Camera, metres: float) -> Camera:
-    spot = camera.position + camera.right * metres
-    return replace(camera, x=float(spot[0]), y=float(spot[1]))
-
-
-def test_point_on_the_axis_is_seen_in_the_middle_of_the_horizon() -> None:
-    camera = Camera(10.0, 20.0, yaw=90.0, fov=90.0, eye=1.5, width=200, height=100, horizon=0.5)
+def test_point_on_the_axis_is_seen_in_the_middle() -> None:
+    camera = Camera(10.0, 20.0, yaw=90.0, fov=90.0, eye=1.5, width=200, height=100)
     x, y, depth = camera.project(np.array([[15.0, 20.0, 1.5], [15.0, 15.0, 1.5]]))
     assert x == pytest.approx([100, 200])  # 45 degrees to the right is the edge of 90 degrees
     assert y == pytest.approx([50, 50])
     assert depth == pytest.approx([5, 5])
 
 
-def test_a_step_aside_moves_near_points_more_than_far_ones() -> None:
-    camera = Camera(0.0, 0.0, yaw=0.0, fov=72.0)
-    points = np.array([[2.0, 8.0, 3.0], [2.0, 40.0, 3.0]])
-    before, _, depth = camera.project(points)
-    after, _, _ = moved_right(camera, 1.2).project(points)
-    assert before - after == pytest.approx(camera.focal * 1.2 / depth)
-    assert (before - after)[0] > 4 * (before - after)[1]
+def test_pitch_turns_the_camera_upwards_and_roll_clockwise() -> None:
+    ahead = np.array([[0.0, 5.0, 1.9]])
+    level = Camera(0.0, 0.0, yaw=0.0, fov=70.0)
+    _, y, _ = replace(level, pitch=5.0).project(ahead)
+    assert y == pytest.approx(120 + level.focal * math.tan(math.radians(5)))
+    x, y, _ = replace(level, roll=90.0).project(ahead + np.array([1.0, 0.0, 0.0]))
+    assert (x, y) == (pytest.approx(160), pytest.approx(120 - level.focal / 5))
 
 
-def test_ray_meets_a_facade_where_the_point_projects() -> None:
-    camera = Camera(3.0, -4.0, yaw=25.0, fov=80.0, width=320)
-    start, direction = np.array([[-20.0, 9.0]]), np.array([[0.96, 0.28]])
-    hits = cast_rays(camera, camera.slopes(1), start, direction, np.array([60.0]))
-    seen = np.isfinite(hits.depth)
-    assert seen.sum() > 200
-    points = start + hits.along[seen, None] * direction
-    x, _, depth = camera.project(np.column_stack([points, np.zeros(len(points))]))
-    assert x == pytest.approx(np.flatnonzero(seen) + 0.5)
-    assert depth == pytest.approx(hits.depth[seen])
+def test_ray_of_a_pixel_meets_the_points_that_project_to_it() -> None:
+    camera = Camera(3.0, -4.0, yaw=25.0, fov=80.0, pitch=7.0, roll=-3.0)
+    pixels = np.array([0.5, 90.0, 319.5]), np.array([0.5, 200.0, 239.5])
+    x, y, depth = camera.project(camera.position + 12.0 * camera.rays(*pixels))
+    assert (x, y) == (pytest.approx(pixels[0]), pytest.approx(pixels[1]))
+    assert depth == pytest.approx(12.0)
 
 
-def test_facade_is_not_seen_from_behind() -> None:
-    camera = Camera(0.0, 0.0, yaw=0.0, fov=60.0)
-    start, direction = np.array([[10.0, 9.0]]), np.array([[-1.0, 0.0]])
-    hits = cast_rays(camera, camera.slopes(1), start, direction, np.array([20.0]))
-    assert not np.isfinite(hits.depth).any()
+def test_wall_is_hit_from_its_front_and_the_nearest_hides_the_others() -> None:
+    rays = np.array([[0.0, 1.0], [-0.6, 0.8]])
+    starts = np.array([[-30.0, 20.0], [-5.0, 9.0], [9.0, 5.0]])
+    directions = np.array([[1.0, 0.0], [1.0, 0.0], [-1.0, 0.0]])  # the last one is seen from behind
+    hits = cast_rays(np.zeros(2), rays, starts, directions, np.array([60.0, 10.0, 18.0]))
+    assert hits.wall.tolist() == [1, 0]
+    assert hits.distance == pytest.approx([9.0, 25.0])
+    assert hits.along == pytest.approx([5.0, 15.0])
 
 
-def test_nearest_facade_hides_the_others() -> None:
-    camera = Camera(0.0, 0.0, yaw=0.0, fov=60.0)
-    starts = np.array([[-30.0, 20.0], [-5.0, 9.0]])
-    directions = np.array([[1.0, 0.0], [1.0, 0.0]])
-    hits = cast_rays(camera, camera.slopes(1), starts, directions, np.array([60.0, 10.0]))
-    assert hits.plane[160] == 1
-    assert hits.depth[160] == pytest.approx(9.0)
-    assert hits.plane[0] == 0  # beside the short one
-
-
-def test_drawn_facade_moves_by_the_pinhole_formula_and_keeps_its_size(
-    plan: CityPlan, painter: QuarterRenderer
+def test_what_one_camera_sees_stands_where_another_one_sees_it(
+    plan: CityPlan, scene: Scene
 ) -> None:
-    side, distance, pixels = 12, 9.0, 16
-    camera = facing(plan.quarters["map"], side, distance)
-    step = pixels / SUPERSAMPLING * distance / camera.focal
-    before = facade_of(painter.view(camera, SUMMER), distance)
-    after = facade_of(painter.view(moved_right(camera, step), SUMMER), distance)
-    both = (before[pixels:] > 0) & (after[:-pixels] > 0)
-    same = before[pixels:] == after[:-pixels]
-    assert both.mean() > 0.2
-    assert same[both].mean() > 0.85  # the rest is rounded to the texel beside
-    unmoved = (before == after)[pixels:][both]
-    assert same[both].mean() > unmoved.mean() + 0.2
+    """Points of one view, with their depth, are found at their pixels and depths in another."""
+    camera = facing(plan.quarters["map"], 12, 9.0)
+    other = replace(
+        camera, x=camera.x + 1.1, y=camera.y - 0.7, yaw=camera.yaw + 8, pitch=4.0, roll=3.0
+    )
+    before, after = (scene.view(each, SUMMER) for each in (camera, other))
+    rows, columns = (before.nearness > 0).nonzero()
+    rays = camera.rays((columns + 0.5) / SUPERSAMPLING, (rows + 0.5) / SUPERSAMPLING)
+    points = camera.position + rays / before.nearness[rows, columns, None]
+    x, y, depth = other.project(points)
+    column, row = (np.floor(v * SUPERSAMPLING).astype(int) for v in (x, y))
+    height, width = after.texels.shape
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    assert inside.mean() > 0.6
+    found = after.nearness[row[inside], column[inside]]
+    same_depth = np.isclose(1 / found, depth[inside], rtol=0.02)
+    assert same_depth.mean() > 0.9  # the rest is hidden by something nearer
+    colours = [
+        view.texels.view(np.uint8).reshape(*view.texels.shape, 4)[..., :3].astype(int)
+        for view in (before, after)
+    ]
+    ours = colours[0][rows[inside], columns[inside]][same_depth]
+    theirs = colours[1][row[inside], column[inside]][same_depth]
+    unmoved = colours[1][rows[inside], columns[inside]][same_depth]
+    assert (np.abs(ours - theirs).max(axis=1) < 20).mean() > 0.85
+    assert (np.abs(ours - theirs).mean()) < 0.5 * np.abs(ours - unmoved).mean()
 
 
-def facade_of(
-    view: RenderBuffers, distance: float
-) -> np.ndarray[tuple[int, int], np.dtype[np.uint32]]:
-    """The canvas where the facade at that depth shows; 0 where trees and cars stand before it."""
-    at_wall = np.abs(view.depth - distance) < 0.01
-    return np.where(np.kron(at_wall, np.ones((SUPERSAMPLING, SUPERSAMPLING), bool)), view.canvas, 0)
-
-
-def test_session_changes_the_light_and_not_the_geometry(
-    plan: CityPlan, painter: QuarterRenderer
-) -> None:
+def test_session_changes_the_light_and_not_the_geometry(plan: CityPlan, scene: Scene) -> None:
     camera = of_role(plan, "database")[7].camera
     # The same day's vehicles and leaves, in the light of the night.
     night = replace(NIGHT, name="summer", foliage="summer")
-    day_view, night_view = painter.view(camera, SUMMER), painter.view(camera, night)
-    assert np.array_equal(day_view.canvas, night_view.canvas)
-    assert np.array_equal(day_view.depth, night_view.depth)
+    day_view, night_view = scene.view(camera, SUMMER), scene.view(camera, night)
+    assert np.array_equal(day_view.texels, night_view.texels)
+    assert np.array_equal(day_view.nearness, night_view.nearness)
 
 
 def test_vehicles_are_others_on_another_day_and_houses_are_not(
-    plan: CityPlan, painter: QuarterRenderer
+    plan: CityPlan, scene: Scene
 ) -> None:
     shots = of_role(plan, "database")[::8]
     other_day = replace(SUMMER, name="another summer day")
     changed = [
-        painter.view(shot.camera, SUMMER).canvas != painter.view(shot.camera, other_day).canvas
+        scene.view(shot.camera, SUMMER).texels != scene.view(shot.camera, other_day).texels
         for shot in shots
     ]
     assert np.mean([mask.any() for mask in changed]) > 0.5
     assert np.mean(changed) < 0.35
 
 
-def test_neighbouring_places_share_houses(plan: CityPlan) -> None:
-    quarter = plan.quarters["map"]
+def test_neighbouring_places_share_houses(plan: CityPlan, scene: Scene) -> None:
     database = [s for s in of_role(plan, "database") if s.number % OPTIONS.views == 0]
-    houses = {shot.place: houses_seen(quarter, shot.camera) for shot in database}
+    houses = {shot.place: houses_seen(scene, shot.camera, 60.0) for shot in database}
     places = {shot.place: shot.camera.position for shot in database}
     neighbours = [
-        (a, b) for a, b in pairwise(sorted(houses)) if np.hypot(*(places[a] - places[b])) < 26
+        (a, b) for a, b in pairwise(sorted(houses)) if math.dist(places[a], places[b]) < 26
     ]
     assert len(neighbours) > 20
     assert all(houses[a] & houses[b] for a, b in neighbours)
     assert all(houses[a] != houses[b] for a, b in neighbours)
 
 
-def test_who_looks_the_other_way_sees_none_of_the_houses(plan: CityPlan) -> None:
-    quarter = plan.quarters["map"]
+def test_who_looks_the_other_way_sees_none_of_the_houses(plan: CityPlan, scene: Scene) -> None:
     seen = {
-        s.place: houses_seen(quarter, s.camera, 25)
-        for s in of_role(plan, "database")
-        if s.number % OPTIONS.views == 0
+        shot.place: houses_seen(scene, shot.camera, 25.0)
+        for shot in of_role(plan, "database")
+        if shot.number % OPTIONS.views == 0
     }
-    turned = [s for s in of_role(plan, "query") if s.kind == "other_way"]
+    turned = [shot for shot in of_role(plan, "query") if shot.kind == "other_way"]
     assert turned
     for shot in turned:
-        assert not houses_seen(quarter, shot.camera, 25) & seen[shot.place]
+        assert not houses_seen(scene, shot.camera, 25.0) & seen[shot.place]
 
 
-def houses_seen(quarter: Quarter, camera: Camera, within_m: float = 60.0) -> set[tuple[int, int]]:
-    hits = cast_rays(
-        camera,
-        camera.slopes(1),
-        quarter.side_starts,
-        quarter.side_directions,
-        quarter.side_lengths,
-    )
-    return {
-        (int(side), int(np.searchsorted(quarter.sides[side].cuts, along, side="right")))
-        for side, along, depth in zip(hits.plane, hits.along, hits.depth, strict=True)
-        if depth < within_m
-    }
+def houses_seen(scene: Scene, camera: Camera, within_m: float) -> set[tuple[int, int]]:
+    return {house for house, away in scene.visible_houses(camera).items() if away < within_m}
 
 
 def test_no_camera_stands_in_a_house(plan: CityPlan) -> None:
     for shot in plan.photos:
         quarter = plan.quarters[shot.quarter]
-        away = quarter.side_starts - shot.camera.position
+        away = quarter.side_starts - shot.camera.position[:2]
         across = away[:, 0] * quarter.side_directions[:, 1]
         across = across - away[:, 1] * quarter.side_directions[:, 0]
         blocks = across.reshape(-1, 4)  # a block has four sides; inside all of them is inside
