@@ -32,7 +32,6 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from lab.benchmarks.report import Report, printed_report
-from lab.datasets.dataset import DatasetPhoto
 from lab.datasets.open_dataset import open_evaluation_set
 from lab.evaluation.query_clusters import cluster_queries
 from services.cli.environment import read_settings
@@ -111,8 +110,12 @@ def bench(
     as_json: JsonOption = False,
 ) -> None:
     """Measure how often place estimates answer, how often they are right, and their calibration."""
+    if not folders and "PLACEWISE_TEST_DATA" not in os.environ:
+        raise Misconfigured(
+            "no_data_set", "Name an evaluation set, or the folder of tower/ in PLACEWISE_TEST_DATA."
+        )
     with printed_report(f"estimates at certainty {CERTAINTY}", as_json) as (report, progress):
-        for folder in folders or [_tower()]:
+        for folder in folders or [Path(os.environ["PLACEWISE_TEST_DATA"]) / "tower"]:
             measure_set(report, describe_set(folder, progress), splits, progress)
 
 
@@ -120,8 +123,7 @@ def measure_set(report: Report, photos: DescribedPhotos, splits: int, progress: 
     """Report the estimates of one evaluation set."""
     bar = progress.add_task(photos.name, total=1 + splits + LEFT_OUT_GROUPS)
     published = fit_and_judge(photos, ~photos.is_query, photos.is_query)
-    add_answers(report, f"{photos.name}, its queries", published)
-    add_reliability(report, f"{photos.name}, its queries", published)
+    add_judged(report, f"{photos.name}, its queries", published)
     progress.advance(bar)
     drawn: list[Judged] = []
     refined: list[Judged] = []
@@ -133,13 +135,8 @@ def measure_set(report: Report, photos: DescribedPhotos, splits: int, progress: 
         unlabelled = photos.is_query & ~labelled
         refined += fit_and_judge(photos, ~photos.is_query, unlabelled, labelled)
         progress.advance(bar)
-    for what, judged in (
-        (f"{photos.name}, {splits} random splits", drawn),
-        (f"{photos.name}, half of its queries labelled", refined),
-    ):
-        if judged:
-            add_answers(report, what, judged)
-            add_reliability(report, what, judged)
+    add_judged(report, f"{photos.name}, {splits} random splits", drawn)
+    add_judged(report, f"{photos.name}, half of its queries labelled", refined)
     left_out = []
     for missing in left_out_labels(photos):
         left_out += fit_and_judge(photos, ~photos.is_query & ~missing, missing)
@@ -148,35 +145,27 @@ def measure_set(report: Report, photos: DescribedPhotos, splits: int, progress: 
         add_left_out(report, f"{photos.name}, labels left out", left_out)
 
 
-def describe_set(folder: Path, progress: Progress, name: str | None = None) -> DescribedPhotos:
-    """Describe an evaluation set, which `name` selects among several, as a new map would be."""
+def describe_set(folder: Path, progress: Progress) -> DescribedPhotos:
+    """Describe an evaluation set as a new map would be."""
     # Decoder processes import the program, and their memory limit leaves no room for torch.
     from lab.cli.evaluation.describers import extractor_describer
     from lab.evaluation.ranking import describe_to_matrix
 
     settings = read_settings()
-    dataset = open_evaluation_set(folder, name)
+    dataset = open_evaluation_set(folder)
     photos = [*dataset.database, *dataset.queries]
     describer = extractor_describer(
         settings.new_map_extractor, None, dataset, settings, progress, fit=True
     )
     with describe_to_matrix(describer.describe, [photo.path for photo in photos]) as rows:
         matrix = np.array(rows)
-    return _described_photos(dataset.name, photos, matrix, len(dataset.database))
-
-
-def _described_photos(
-    name: str, photos: Sequence[DatasetPhoto], rows: NDArray[np.float32], database: int
-) -> DescribedPhotos:
-    """Join photos, of which the first `database` are no queries, with their descriptors."""
-    settings = read_settings()
     is_path = any("/" in (photo.place or "") for photo in photos)
     return DescribedPhotos(
-        name,
-        rows,
+        dataset.name,
+        matrix,
         [PhotoLocation(photo.latitude, photo.longitude, photo.place) for photo in photos],
         [photo.captured_at for photo in photos],
-        np.arange(len(photos)) >= database,
+        np.arange(len(photos)) >= len(dataset.database),
         cluster_queries(photos).labels,
         LevelScheme(labels_are_paths=is_path, radii_m=settings.level_radii_m),
         settings.estimate_radius_m,
@@ -279,8 +268,14 @@ def left_out_labels(photos: DescribedPhotos) -> Iterable[Mask]:
         yield np.isin(labels, names[group::LEFT_OUT_GROUPS])
 
 
-def add_answers(report: Report, what: str, judged: Sequence[Judged]) -> None:
-    """Report the shares of answers, and of right ones among them, in %."""
+def add_judged(report: Report, what: str, judged: Sequence[Judged]) -> None:
+    """Report the shares of answers and of right ones among them, in %, and their calibration."""
+    if judged:
+        _add_answers(report, what, judged)
+        _add_reliability(report, what, judged)
+
+
+def _add_answers(report: Report, what: str, judged: Sequence[Judged]) -> None:
     known = [j for j in judged if j.is_answer_right is not None]
     finest = [j for j in known if j.is_finest]
     precision = 100 * CERTAINTY
@@ -294,7 +289,7 @@ def add_answers(report: Report, what: str, judged: Sequence[Judged]) -> None:
     )
 
 
-def add_reliability(report: Report, what: str, judged: Sequence[Judged]) -> None:
+def _add_reliability(report: Report, what: str, judged: Sequence[Judged]) -> None:
     """Report the ECE of each level, and show the mean of stated and of observed probabilities."""
     table = Table("level", "stated", "observed", "ECE", title=what)
     for position in range(max(len(j.is_right) for j in judged)):
@@ -320,15 +315,6 @@ def add_left_out(report: Report, what: str, judged: Sequence[Judged]) -> None:
         Share("answered at the finest level", judged, lambda j: j.is_finest, at_most=most),
         Share("wrong at any level", judged, lambda j: j.is_answer_right is False),
     )
-
-
-def _tower() -> Path:
-    if "PLACEWISE_TEST_DATA" not in os.environ:
-        raise Misconfigured(
-            "no_data_set",
-            "Name an evaluation set, or the folder of tower/ in PLACEWISE_TEST_DATA.",
-        )
-    return Path(os.environ["PLACEWISE_TEST_DATA"]) / "tower"
 
 
 def _rank(scores: NDArray[np.float32], without: int | None = None) -> IndexRanking:

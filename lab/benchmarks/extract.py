@@ -31,7 +31,7 @@ from rich.progress import Progress
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from lab.benchmarks.fleet.load_generator import make_jpegs
+from lab.benchmarks.load_generator import make_jpegs
 from lab.benchmarks.report import Report, parse_integers, printed_report
 from services.cli.environment import read_settings
 from services.cli.output import JsonOption

@@ -25,7 +25,7 @@ from rich.progress import TaskID
 from sqlalchemy import select
 
 from lab.benchmarks.fleet import Fleet, ServiceProcess, open_fleet, start_servers
-from lab.benchmarks.fleet.load_generator import (
+from lab.benchmarks.load_generator import (
     make_jpegs,
     multipart_forms,
     upload_all,
@@ -104,16 +104,13 @@ def _measure_cpu(
 ) -> None:
     # What a process does once: models, decoders, connections, and the kernels of a larger map.
     _upload_and_wait(fleet, jpegs, photos + 2 * batch, lambda left: None)
-    before, servers_before = fleet.cpu_seconds(), fleet.server_cpu_seconds()
+    before = fleet.cpu_seconds()
     _upload_and_wait(fleet, jpegs, photos, on_left)
-    after, servers_after = fleet.cpu_seconds(), fleet.server_cpu_seconds()
+    after = fleet.cpu_seconds()
     assert not fleet.crashed, fleet.logs()
+    each = {name: 1000 * (after[name] - before[name]) / photos for name in after}
     used = {
-        service: sum(
-            1000 * (after[name] - before[name]) / photos
-            for name in after
-            if name.startswith(service)
-        )
+        service: sum(each[name] for name in each if name.startswith(service))
         for service in SERVICES
     }
     model = _model_milliseconds(width, batch)
@@ -124,9 +121,8 @@ def _measure_cpu(
     target = TARGET_MILLISECONDS.get(width)
     report.add(f"all services {at}", sum(used.values()), "ms", at_most=target)
     report.add(f"the backbone, not included, {at}", model, "ms")
-    for name, seconds in servers_after.items():
-        milliseconds = 1000 * (seconds - servers_before[name]) / photos
-        report.add(f"{name} {at}", milliseconds, "ms")
+    for server in fleet.servers.processes:
+        report.add(f"{server} {at}", each[server], "ms")
 
 
 def _upload_and_wait(
@@ -188,7 +184,7 @@ def _start_bare_server(fleet: Fleet) -> Iterator[str]:
     port = free_ports(1)[0]
     service = ServiceProcess(
         "bare",
-        [sys.executable, "-m", "lab.benchmarks.fleet.bare_upload", str(port)],
+        [sys.executable, "-m", "lab.benchmarks.bare_upload", str(port)],
         fleet["gateway-0"].environment | {"PYTHONPATH": str(Path(__file__).parents[2])},
         fleet["gateway-0"].log_path.with_name("bare.log"),
         f"http://127.0.0.1:{port}/readyz",

@@ -20,9 +20,9 @@ from uuid import UUID
 import typer
 from sqlalchemy import func, insert, select
 
-from lab.benchmarks.chaos.run import count_unfinished_jobs
 from lab.benchmarks.fleet import Fleet, open_fleet
-from lab.benchmarks.fleet.load_generator import (
+from lab.benchmarks.invariants import count_unfinished_jobs
+from lab.benchmarks.load_generator import (
     HttpCaller,
     make_jpegs,
     multipart_form,

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
-from lab.benchmarks.chaos import run_chaos
-from lab.benchmarks.chaos.faults import all_faults
+from lab.benchmarks.chaos import all_faults, run_chaos
 
 # What no other test does to a whole deployment. `placewise bench chaos` injects all faults; those
 # on one component are also in the other modules of this folder, in tests/contract/storage (a store
@@ -25,13 +22,10 @@ FAULTS = {
 
 
 @pytest.mark.timeout(900)
-def test_whatever_dies_no_photo_is_lost_doubled_or_stuck_and_no_answer_is_wrong(
-    tmp_path: Path,
-) -> None:
+def test_whatever_dies_no_photo_is_lost_doubled_or_stuck_and_no_answer_is_wrong() -> None:
     faults = [fault for fault in all_faults() if fault.name in FAULTS]
     assert len(faults) == len(FAULTS)
     run = run_chaos(
-        tmp_path,
         photos=6 * len(faults),  # two before, two during and two after each fault
         fault_seconds=1.0,
         seed=20_261_121,

@@ -12,7 +12,7 @@ from uuid import UUID
 import httpx2
 import psutil
 
-from lab.benchmarks.chaos.run import check_invariants, count_unfinished_jobs
+from lab.benchmarks.invariants import check_invariants, count_unfinished_jobs
 from shared.catalog.database.session import Catalog
 from shared.storage import FolderStore
 from tests.support.photos import photo_bytes

@@ -7,7 +7,6 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 from uuid import UUID
 
@@ -15,8 +14,8 @@ import httpx2
 import pytest
 from sqlalchemy import select
 
-from lab.benchmarks.fleet import Fleet, start_servers
-from lab.benchmarks.fleet.load_generator import wait_for_jobs
+from lab.benchmarks.fleet import open_fleet
+from lab.benchmarks.load_generator import wait_for_jobs
 from shared.catalog.chunks import Descriptor
 from tests.support.photos import photo_bytes
 from tests.support.server import SERVICES_KEY
@@ -126,21 +125,16 @@ class Clients:
 
 
 @pytest.mark.timeout(600)
-def test_restarting_one_of_each_service_fails_no_request_and_loses_no_job(tmp_path: Path) -> None:
-    with (
-        start_servers() as servers,
-        Fleet(
-            tmp_path,
-            servers,
-            gateways=2,
-            extractors=2,
-            replicas=2,
-            stewards=2,
-            executed=False,
-            extractor="test-slow-avg:milliseconds=20,width=1024",
-            batch_photos=4,
-        ) as fleet,
-    ):
+def test_restarting_one_of_each_service_fails_no_request_and_loses_no_job() -> None:
+    with open_fleet(
+        gateways=2,
+        extractors=2,
+        replicas=2,
+        stewards=2,
+        executed=False,
+        extractor="test-slow-avg:milliseconds=20,width=1024",
+        batch_photos=4,
+    ) as fleet:
         fleet.start()
         clients = Clients(fleet.gateway_urls)
         try:

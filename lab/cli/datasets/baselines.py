@@ -4,12 +4,13 @@ Weak baselines (mean colour, colour histogram, thumbnail) must find almost nothi
 must differ; otherwise the city measures nothing: a data set on which a weak one recognises places
 can be solved by colour or layout alone. Results on a generated city are not comparable with
 published ones. Baselines with a vocabulary are also evaluated with word weights, fitted in memory
-on the database rows.
+on the database rows, and the fitted one after PCA whitening.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +20,20 @@ from PIL import Image
 from rich.progress import Progress
 
 from lab.city.plan import CityPlan, positions_m
+from lab.datasets.open_dataset import open_evaluation_set
 from lab.evaluation.exact_knn import exact_knn
 from lab.evaluation.recall import positives_within, recall_at_k
+from services.cli.environment import read_settings
 from shared.evaluation.places.evidence import PhotoLocation
+from shared.extractor_config.configs import EXTRACTOR_CONFIGS
 from shared.utm_filenames import upload_fields_of_file_name
 from shared.word_weights.training_pairs import sample_pairs
 from shared.word_weights.weights import PairStatistics, apply_word_weights, empty_pair_statistics
 
 SEED = 0
+EXTRACTOR = "efficientnet-lite0-vlad128"
+PCA_DIMENSIONS = (512, 256, 128)
+"""Those that exceed the number of database photos are skipped"""
 
 Rows = NDArray[np.float32]
 
@@ -66,10 +73,34 @@ def thumbnail(photo: Image.Image) -> Rows:
     return _unit(pixels - pixels.mean())
 
 
+@cache
+def _untrained_network() -> Any:
+    import timm
+    import torch
+
+    torch.manual_seed(SEED)
+    network = timm.create_model(
+        "tf_efficientnet_lite0", pretrained=False, features_only=True, out_indices=(3,)
+    )
+    return network.eval().requires_grad_(False)
+
+
+def _untrained_descriptor(photo: Image.Image) -> Rows:
+    """Return the mean of the features of EfficientNet-Lite0 with random weights."""
+    import torch
+
+    pixels = np.asarray(photo, np.float32).transpose(2, 0, 1)[None] / 127.5 - 1
+    with torch.inference_mode():
+        features = _untrained_network()(torch.from_numpy(pixels))[0][0].flatten(1).numpy()
+    lengths = np.linalg.norm(features, axis=0, keepdims=True)
+    return _unit((features / np.maximum(lengths, 1e-12)).mean(axis=1))
+
+
 BASELINE_DESCRIPTORS: dict[str, Callable[[Image.Image], Rows]] = {
     "average colour": average_colour,
     "colour histogram": _colour_histogram,
     "thumbnail 16x16": thumbnail,
+    "untrained network": _untrained_descriptor,
 }
 
 
@@ -101,14 +132,11 @@ def _fit_word_weights(database: Rows, names: Sequence[str], words: int) -> list[
     return weights
 
 
-def _fit_and_apply_word_weights(queries: Rows, weights: Sequence[float]) -> Rows:
+def _apply_word_weights(queries: Rows, weights: Sequence[float]) -> Rows:
     """Weight the words of each query; a query without weighted words is left unchanged."""
-    weighted_queries = [apply_word_weights(query, weights) for query in queries]
+    weighted = [apply_word_weights(query, weights) for query in queries]
     return np.stack(
-        [
-            query if weighted is None else weighted.astype(np.float32)
-            for query, weighted in zip(queries, weighted_queries, strict=True)
-        ]
+        [q if w is None else w.astype(np.float32) for q, w in zip(queries, weighted, strict=True)]
     )
 
 
@@ -133,12 +161,11 @@ def evaluate_baselines(plan: CityPlan, out: Path, progress: Progress) -> list[di
         return []
     positives = positives_within(positions_m(queries), positions_m(database))
     other_way = np.array([photo.kind == "other_way" for photo in queries])
+    paths = [photo.path(out) for photo in database + queries]
     results = []
-    described = _describe_photos(
-        [photo.path(out) for photo in database + queries], len(database), progress
-    )
-    for name, query_rows, database_rows in _add_word_weighted(
-        *described, [photo.name for photo in database]
+    for name, query_rows, database_rows in (
+        *_describe_without_vocabulary(paths, len(database), progress),
+        *_describe_with_vocabulary(out, paths, len(database), progress),
     ):
         ranked = exact_knn(query_rows, database_rows, max(BASELINE_KS)).indices
         results.append(
@@ -152,22 +179,15 @@ def evaluate_baselines(plan: CityPlan, out: Path, progress: Progress) -> list[di
     return results
 
 
-def _describe_photos(
+Described = tuple[str, Rows, Rows]
+"""Name of a baseline, and its rows of the queries and of the database"""
+
+
+def _describe_without_vocabulary(
     paths: Sequence[Path], database: int, progress: Progress
-) -> tuple[list[tuple[str, Rows]], dict[str, int]]:
-    """Describe photos with each baseline.
-
-    Args:
-        paths: Photo files; the first `database` of them may be fitted on.
-        database: Number of database photos.
-        progress: Shows the photos described.
-
-    Returns:
-        (photos, D) unit rows by baseline, and the number of words of those with a vocabulary.
-    """
-    from lab.cli.datasets.network_baselines import NetworkBaselines  # imports torch
-
-    bar = progress.add_task("baselines: no network", total=len(paths))
+) -> Iterator[Described]:
+    """Yield the rows of photos, of which the first `database` are those of the database."""
+    bar = progress.add_task("baselines: photos", total=len(paths))
     rows_by_name: dict[str, list[Rows]] = {name: [] for name in BASELINE_DESCRIPTORS}
     for path in paths:
         with Image.open(path) as image:
@@ -175,37 +195,40 @@ def _describe_photos(
         for name, describe in BASELINE_DESCRIPTORS.items():
             rows_by_name[name].append(describe(photo))
         progress.advance(bar)
-    described = [(name, np.stack(rows)) for name, rows in rows_by_name.items()]
-    bar = progress.add_task("baselines: networks", total=len(paths))
-    advance: Callable[[int], None] = lambda count: progress.advance(bar, count)  # noqa: E731
-    networks = NetworkBaselines(paths[:database])
-    described += networks.describe(paths, advance).items()
-    return described, networks.words
+    for name, rows in rows_by_name.items():
+        yield name, np.stack(rows[database:]), np.stack(rows[:database])
 
 
-def _add_word_weighted(
-    described: Sequence[tuple[str, Rows]], words: Mapping[str, int], names: Sequence[str]
-) -> list[tuple[str, Rows, Rows]]:
-    """Split rows into queries and database, and add a word-weighted variant per vocabulary.
+def _describe_with_vocabulary(
+    out: Path, paths: Sequence[Path], database: int, progress: Progress
+) -> Iterator[Described]:
+    """Yield the rows of EXTRACTOR, with word weights where the city is large enough for them."""
+    from lab.cli.evaluation.compare_extractors import whiten_set  # imports torch
+    from lab.cli.evaluation.describers import extractor_describer
 
-    Args:
-        described: Rows by baseline, database rows first.
-        words: Number of words of baselines with a vocabulary.
-        names: File names of the database photos.
-
-    Returns:
-        (name, query rows, database rows). Cities too small to fit weights get no variants.
-    """
-    entries = []
-    for name, rows in described:
-        database, queries = rows[: len(names)], rows[len(names) :]
-        entries.append((name, queries, database))
-        weights = _fit_word_weights(database, names, words[name]) if name in words else None
+    settings, evaluation_set = read_settings(), open_evaluation_set(out)
+    names = [path.name for path in paths[:database]]
+    for vocabulary in ("shipped", "fitted"):
+        name, fit = f"{EXTRACTOR}, {vocabulary} vocabulary", vocabulary == "fitted"
+        describer = extractor_describer(
+            EXTRACTOR, None, evaluation_set, settings, progress, fit=fit
+        )
+        bar = progress.add_task(f"baselines: {vocabulary} vocabulary", total=len(paths))
+        batches = []
+        for batch in describer.describe(paths):
+            batches.append(batch)
+            progress.advance(bar, len(batch))
+        rows = np.concatenate(batches)
+        queries, of_map = rows[database:], rows[:database]
+        yield name, queries, of_map
+        words = rows.shape[1] // EXTRACTOR_CONFIGS[EXTRACTOR].width
+        weights = _fit_word_weights(of_map, names, words)
         if weights is not None:
-            entries.append(
-                (f"{name}, word weights", _fit_and_apply_word_weights(queries, weights), database)
-            )
-    return entries
+            yield f"{name}, word weights", _apply_word_weights(queries, weights), of_map
+        for dimension in PCA_DIMENSIONS if fit else ():
+            if database > dimension:
+                reduced, of_queries, _ = whiten_set(of_map, queries, dimension, settings.device)
+                yield f"{name}, PCA to {dimension}", of_queries, reduced
 
 
 def _recall_shares(

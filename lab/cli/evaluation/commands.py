@@ -254,26 +254,28 @@ def evaluate(
         rules: OptionValues = {"--protocol": protocol, "--rule": rule}
         models = {name: value for name, value in model_options.items() if name not in rules}
         _reject_options("with --predictions", map_options | models)
+        if len(sets or ()) > 1:
+            raise InvalidRequest(
+                "which_set", "A predictions file belongs to one set. Pass --set once."
+            )
         require_packages()
-        from lab.cli.evaluation.results import (
-            evaluate_predictions,
-            evaluate_predictions_of_set,
-        )
+        from lab.cli.evaluation.results import evaluate_predictions, read_evaluation_set
+        from lab.datasets.open_dataset import open_evaluation_set
 
+        set_name = sets[0] if sets else None
         if ground_truth is not None:
             _reject_options("with --ground-truth", rules)
-            evaluate_predictions(
-                predictions, ground_truth, database, queries, data, sets, report_options
-            )
-            return
-        if data is None:
+            evaluation_set = read_evaluation_set(ground_truth, database, queries, data, set_name)
+        elif data is None:
             raise InvalidRequest(
                 "no_ground_truth",
                 "--predictions requires the data set, --data DIR --set NAME, or a ground "
                 "truth file, --ground-truth GT.npy.",
             )
-        _reject_options("without --ground-truth", file_options)
-        evaluate_predictions_of_set(predictions, data, sets, protocol, rule, report_options)
+        else:
+            _reject_options("without --ground-truth", file_options)
+            evaluation_set = open_evaluation_set(data, set_name, protocol=protocol, rule=rule)
+        evaluate_predictions(predictions, evaluation_set, report_options)
         return
     if data is not None:
         lists: OptionValues = {"--database": database, "--queries": queries}

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from rich.progress import Progress
 from rich.table import Column
 
@@ -51,11 +50,11 @@ SEED = 0
 CHECKPOINT_SUFFIXES = (".ckpt", ".pth")
 
 
-def _whiten_set(
+def whiten_set(
     database: Rows,
     queries: Rows,
     components: int,
-    device: torch.device,
+    device: str,
     on_progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> tuple[Rows, Rows, float]:
     """Fit a PCA whitening on the database rows and project the rows of a data set.
@@ -76,8 +75,8 @@ def _whiten_set(
     block_rows = max(1, BLOCK_BYTES // (4 * dimension))
     batches = (database[sampled[b : b + block_rows]] for b in range(0, len(sampled), block_rows))
     whitening = fit_pca_stream(batches, len(sampled), dimension, components, on_progress)
-    projection = PcaProjection(whitening, device)
-    clock = inference_clock(device)
+    chosen = choose_device(device)
+    projection, clock = PcaProjection(whitening, chosen), inference_clock(chosen)
     started = clock()
     reduced = [_project(rows, projection, block_rows) for rows in (database, queries)]
     seconds = clock() - started
@@ -244,8 +243,8 @@ def _evaluate_entry(
     ):
         milliseconds = describer.describe.milliseconds_a_photo()
         if entry.pca is not None:
-            database, queries, projection_ms = _whiten_set(
-                database, queries, entry.pca, choose_device(settings.device), on_progress
+            database, queries, projection_ms = whiten_set(
+                database, queries, entry.pca, settings.device, on_progress
             )
             if milliseconds is not None:
                 milliseconds += projection_ms

@@ -1,8 +1,4 @@
-"""Output of `placewise evaluate`: metrics, reports and tables.
-
-Also implements `placewise evaluate --predictions P.npy --ground-truth GT.npy`, which evaluates
-rankings that were computed elsewhere.
-"""
+"""Output of `placewise evaluate`: metrics, reports and tables, also of a file of predictions."""
 
 from __future__ import annotations
 
@@ -17,9 +13,8 @@ from lab.cli.evaluation.commands import ReportOptions
 from lab.datasets.check import find_suspect_labels
 from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.datasets.ground_truth_files import read_ground_truth, read_integer_lists
-from lab.datasets.open_dataset import open_evaluation_set
 from lab.datasets.photo_lists import read_photo_list
-from lab.evaluation.exact_knn import Indices, Rankings
+from lab.evaluation.exact_knn import Rankings
 from lab.evaluation.query_clusters import cluster_queries, singleton_clusters
 from lab.evaluation.ranking import DEFAULT_KS
 from lab.evaluation.report.page import render_report
@@ -212,103 +207,67 @@ PREDICTIONS_PROTOCOL = "predictions file"
 
 
 def evaluate_predictions(
-    predictions: Path,
-    ground_truth: Path,
-    database: Path | None,
-    queries: Path | None,
-    photos: Path | None,
-    sets: Sequence[str] | None,
-    options: ReportOptions,
+    predictions: Path, evaluation_set: EvaluationSet, options: ReportOptions
 ) -> None:
-    """Evaluate a file of predictions against a ground truth file.
-
-    Args:
-        predictions: (queries, k) database indices, best first, `.npy`.
-        ground_truth: The positives of each query, `.npy`.
-        database: List of the database photos' names, or None.
-        queries: List of the queries' names, or None.
-        photos: Root folder of the names; None for the folder of each list.
-        sets: At most one name, for the report.
-        options: Output options.
+    """Evaluate (queries, k) database indices, best first, of an `.npy` file on a set.
 
     Raises:
-        InvalidRequest: `one_list`, `which_set`, and errors of reading the files.
+        InvalidRequest: Errors of reading the predictions.
         Misconfigured: `out_unwritable`.
     """
-    if (database is None) != (queries is None):
-        raise InvalidRequest("one_list", "--database and --queries must be given together.")
     check_output_folders(options)
     ranked = read_predictions(predictions)
-    name = _only_set(sets) or ground_truth.stem
-    rule = f"given by {ground_truth.name}"
-    photo_lists: tuple[tuple[DatasetPhoto, ...], tuple[DatasetPhoto, ...]]
-    if database is not None and queries is not None:
-        photo_lists = read_photo_list(database, photos), read_photo_list(queries, photos)
-        database_names, query_names = ([photo.name for photo in role] for role in photo_lists)
-        positives, rule = read_ground_truth(
-            ground_truth, database=database_names, queries=query_names
-        )
-        check_predictions(predictions, ranked, positives, len(database_names))
-    else:
-        positives = read_integer_lists(ground_truth)
-        check_predictions(predictions, ranked, positives, None)
-        # Without lists, queries are identified by their numbers.
-        numbered = tuple(
-            DatasetPhoto(Path(f"query {q}"), f"query {q}") for q in range(len(positives))
-        )
-        photo_lists = (), numbered
-    evaluation_set = EvaluationSet(
-        name=name,
-        root=photos or predictions.parent,
-        database=photo_lists[0],
-        queries=photo_lists[1],
-        positives=tuple(positives),
-        rule=rule,
-        protocol=PREDICTIONS_PROTOCOL,
+    check_predictions(
+        predictions, ranked, evaluation_set.positives, len(evaluation_set.database) or None
     )
-    _output_predictions(predictions, ranked, evaluation_set, options)
-
-
-def evaluate_predictions_of_set(
-    predictions: Path,
-    data: Path,
-    sets: Sequence[str] | None,
-    protocol: str | None,
-    rule: str | None,
-    options: ReportOptions,
-) -> None:
-    """Evaluate a file of predictions on a set of a data set, with the set's own ground truth.
-
-    Args:
-        predictions: (queries, k) database indices, best first, `.npy`, in the order of the set.
-        data: Folder of the data set.
-        sets: At most one name; may be omitted if there is only one set.
-        protocol: One of the layout's protocols, or None.
-        rule: Positive-match criterion, or None.
-        options: Output options.
-
-    Raises:
-        InvalidRequest: `which_set`, and errors of opening the set and reading the predictions.
-        Misconfigured: `out_unwritable`.
-    """
-    evaluation_set = open_evaluation_set(data, _only_set(sets), protocol=protocol, rule=rule)
-    check_output_folders(options)
-    ranked = read_predictions(predictions)
-    check_predictions(predictions, ranked, evaluation_set.positives, len(evaluation_set.database))
-    _output_predictions(predictions, ranked, evaluation_set, options)
-
-
-def _only_set(sets: Sequence[str] | None) -> str | None:
-    if sets and len(sets) > 1:
-        raise InvalidRequest("which_set", "A predictions file belongs to one set. Pass --set once.")
-    return sets[0] if sets else None
-
-
-def _output_predictions(
-    predictions: Path, ranked: Indices, evaluation_set: EvaluationSet, options: ReportOptions
-) -> None:
     truncated = ranked[:, : options.depth]
     rankings = Rankings(truncated, np.zeros(truncated.shape, np.float32))
     result = evaluate_rankings(evaluation_set, rankings, options, has_scores=False, about={})
     run = EvaluationRun(predictions.stem, None, {"predictions": predictions.name})
     output_results(run, [result], options)
+
+
+def read_evaluation_set(
+    ground_truth: Path,
+    database: Path | None,
+    queries: Path | None,
+    photos: Path | None,
+    name: str | None,
+) -> EvaluationSet:
+    """Make an evaluation set of a ground truth file and lists of photos.
+
+    Args:
+        ground_truth: The positives of each query, `.npy`.
+        database: List of the database photos' names, or None.
+        queries: List of the queries' names, or None. Without lists, queries are numbered, and the
+            set has no database.
+        photos: Root folder of the names; None for the folder of each list.
+        name: Name of the set; None for that of the file.
+
+    Raises:
+        InvalidRequest: `one_list`, and errors of reading the files.
+    """
+    rule = f"given by {ground_truth.name}"
+    of_database: tuple[DatasetPhoto, ...] = ()
+    if database is not None and queries is not None:
+        of_database, of_queries = (read_photo_list(each, photos) for each in (database, queries))
+        positives, rule = read_ground_truth(
+            ground_truth,
+            database=[photo.name for photo in of_database],
+            queries=[photo.name for photo in of_queries],
+        )
+    elif database is not None or queries is not None:
+        raise InvalidRequest("one_list", "--database and --queries must be given together.")
+    else:
+        positives = read_integer_lists(ground_truth)
+        numbers = (f"query {number}" for number in range(len(positives)))
+        of_queries = tuple(DatasetPhoto(Path(number), number) for number in numbers)
+    return EvaluationSet(
+        name=name or ground_truth.stem,
+        root=photos or ground_truth.parent,
+        database=of_database,
+        queries=of_queries,
+        positives=tuple(positives),
+        rule=rule,
+        protocol=PREDICTIONS_PROTOCOL,
+    )

@@ -1,27 +1,14 @@
-"""`placewise train` and `placewise grid`: train place descriptors, and run hyperparameter grids.
-
-`_TerminalDisplay` shows the progress of a run on the terminal.
-"""
+"""`placewise train` and `placewise grid`: train place descriptors, and run hyperparameter grids."""
 
 from __future__ import annotations
 
-import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import Progress, TaskID
 from rich.table import Column
 
 from lab.cli.training.options import given_options, with_training_options
@@ -43,43 +30,19 @@ from services.cli.output import (
     print_message,
     print_note,
     print_table,
+    progress_bar,
 )
 from shared.errors import InvalidRequest
 
-LOG_INTERVAL_SECONDS = 60.0
-"""Interval of progress lines if stderr is not a terminal, where bars would not be visible."""
 SHOWN_KS = ("1", "5", "10", "15", "20")
 
 
+@dataclass(slots=True)
 class _TerminalDisplay:
     """Implements `lab.training.run_control.Display` with progress bars on stderr."""
 
-    def __init__(self) -> None:
-        self._bars = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[note]}"),
-            console=err_console,
-            transient=True,
-            disable=not err_console.is_terminal,  # it would print an empty line at its end
-        )
-        self._tasks: dict[str, TaskID] = {}
-        self._line_at = time.monotonic() + LOG_INTERVAL_SECONDS
-
-    def __enter__(self) -> Self:
-        self._bars.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._bars.stop()
+    bars: Progress
+    tasks: dict[str, TaskID] = field(default_factory=dict)
 
     def info(self, text: str) -> None:
         print_note(text)
@@ -87,21 +50,13 @@ class _TerminalDisplay:
     def warn(self, text: str) -> None:
         err_console.print(f"[yellow]{escape(text)}[/yellow]", soft_wrap=True)
 
-    def progress(self, what: str, done: int, most: int, note: str = "") -> None:
-        if not err_console.is_terminal:
-            self._log_line(what, done, most, note)
-            return
-        task = self._tasks.get(what)
-        if task is None:
-            task = self._tasks[what] = self._bars.add_task(escape(what), total=most, note="")
-        self._bars.update(task, completed=done, total=most, note=escape(note))
-        if done >= most:
-            self._bars.remove_task(self._tasks.pop(what))
-
-    def _log_line(self, what: str, done: int, most: int, note: str) -> None:
-        if time.monotonic() >= self._line_at:
-            self._line_at = time.monotonic() + LOG_INTERVAL_SECONDS
-            self.info(f"{what}: {done}/{most}  {note}".rstrip())
+    def progress(self, what: str, done: int, total: int, note: str = "") -> None:
+        if what not in self.tasks:
+            self.tasks[what] = self.bars.add_task(escape(what), total=total)
+        description = escape(f"{what}  {note}".rstrip())
+        self.bars.update(self.tasks[what], completed=done, total=total, description=description)
+        if done >= total:
+            self.bars.remove_task(self.tasks.pop(what))
 
 
 def _print_summary(report: Json) -> None:
@@ -195,7 +150,8 @@ def _run_training(config: Path | None, resume: Path | None, overrides: dict[str,
     from lab.training import run
     from lab.training.run_control import RunStopped, StopRequest
 
-    with _TerminalDisplay() as display, StopRequest().handle_signals() as stop:
+    with progress_bar() as bars, StopRequest().handle_signals() as stop:
+        display = _TerminalDisplay(bars)
         try:
             if resume is not None:
                 return run.resume(resume, overrides, display, stop)
@@ -262,8 +218,9 @@ def _run_grid_command(
         out.mkdir(parents=True, exist_ok=True)
         write_leaderboard(leaderboard(plan, outcomes), out)
 
-    with _TerminalDisplay() as display, StopRequest().handle_signals() as stop:
+    with progress_bar() as bars, StopRequest().handle_signals() as stop:
         try:
+            display = _TerminalDisplay(bars)
             outcomes = run_grid(plan, out, display, stop, write)
         except RunStopped as stopped:
             print_note("Stopped. Run the same command again to continue the grid.")

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from lab.benchmarks.fleet.fault_injection import FaultProxy, ProxyMode
+from lab.benchmarks.fault_injection import FaultProxy, ProxyMode
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
 from shared.storage.s3 import Bucket, S3Store

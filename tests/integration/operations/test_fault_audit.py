@@ -7,7 +7,7 @@ from uuid import UUID
 import pytest
 from sqlalchemy import delete, update
 
-from lab.benchmarks.chaos.run import InvariantViolations, check_invariants
+from lab.benchmarks.invariants import InvariantViolations, check_invariants
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.session import Catalog
 from shared.catalog.photos import Photo

@@ -11,7 +11,7 @@ import httpx2
 import pytest
 from redis import Redis
 
-from lab.benchmarks.fleet.fault_injection import FaultProxy, MessageDuplicator, ProxyMode
+from lab.benchmarks.fault_injection import FaultProxy, MessageDuplicator, ProxyMode
 from shared.jobs.wakeups import WakeupQueue
 from tests.support.servers import start_redis
 from tests.support.servers.daemon import free_ports

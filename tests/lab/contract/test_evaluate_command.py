@@ -46,7 +46,7 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
 def city(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten photos of five places, and six queries, one of them outside of the map."""
     out = tmp_path_factory.mktemp("city") / "town"
-    options = CityOptions(5, 2, 6, 0, 0, 0.17, 64, 64, False)
+    options = CityOptions(5, 2, 6, 1, 0, 0.17, 64, 64, False)
     write_city(make_plan(options), out)
     return out
 

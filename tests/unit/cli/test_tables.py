@@ -7,7 +7,6 @@ import re
 import pytest
 from rich.progress_bar import ProgressBar
 
-from lab.cli.training.commands import _TerminalDisplay
 from services.cli import output
 from services.cli.output import Table, print_message, print_table, progress_bar
 
@@ -140,8 +139,6 @@ def test_progress_is_a_line_from_time_to_time_where_stderr_is_not_a_terminal(
     with progress_bar() as progress:
         bar = progress.add_task("reading a", total=3000)
         progress.update(bar, completed=1000)
-    with _TerminalDisplay():
-        pass
     assert capsys.readouterr().err == "", "a short command prints none"
     monkeypatch.setattr(output, "LINE_SECONDS", 0)
     progress.update(bar, completed=1000)

@@ -12,9 +12,8 @@ from typer.testing import CliRunner
 from lab.benchmarks import estimates
 from lab.benchmarks.estimates import (
     DescribedPhotos,
-    add_answers,
+    add_judged,
     add_left_out,
-    add_reliability,
     draw,
     fit_and_judge,
     left_out_labels,
@@ -52,8 +51,7 @@ def test_queries_of_clear_places_are_answered_rightly() -> None:
     judged = fit_and_judge(photos, ~photos.is_query, photos.is_query)
     assert len(judged) == PLACES
     report = Report("estimates")
-    add_answers(report, "house", judged)
-    add_reliability(report, "house", judged)
+    add_judged(report, "house", judged)
     measured = {figure.what: figure.measured for figure in report.figures}
     assert measured["house: answered"] > 80
     assert measured["house: right"] == 100

@@ -1,9 +1,8 @@
-"""What `placewise bench` says of its figures, and where it can't run."""
+"""What `placewise bench` says of its figures."""
 
 from __future__ import annotations
 
 import contextlib
-import importlib
 
 import pytest
 import typer
@@ -39,17 +38,6 @@ def test_missed_figure_is_exit_code_1(capsys: pytest.CaptureFixture[str], missed
     with ended, printed_report("anything", as_json=False) as (report, _):
         report.add("requests failed", int(missed), at_most=0)
     assert ("missed" in capsys.readouterr().out) == missed
-
-
-def test_without_a_checkout_it_says_what_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(name: str) -> None:
-        raise ModuleNotFoundError("No module named 'lab.benchmarks'", name="lab.benchmarks")
-
-    monkeypatch.setattr(importlib, "import_module", fail)
-    ended = runner.invoke(app, ["bench", "chaos"])
-    assert ended.exit_code == 1
-    assert ended.output.startswith("no_benchmarks: ")
-    assert "make setup" in ended.output
 
 
 @pytest.mark.parametrize("widths", ["", "1,x", "0,1"])

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from uuid import UUID
 
@@ -14,19 +12,25 @@ from rich.progress import Progress
 from typer.testing import CliRunner
 
 from lab.benchmarks.report import Report
-from lab.benchmarks.search import comparison
-from lab.benchmarks.search.brute_force import BruteForce, Ranking, same_ranking
-from lab.benchmarks.search.comparison import MATCHED_CASE, compare_methods, report_comparison
-from lab.benchmarks.search.growth import measure_growth
-from lab.benchmarks.search.methods import PLACEWISE, SearchMethod, placewise_search
-from lab.benchmarks.search.synthetic_map import (
+from lab.benchmarks.search import (
+    MATCHED_CASE,
+    PLACEWISE,
+    BruteForce,
+    Ranking,
+    SearchMethod,
+    compare_methods,
+    measure_growth,
+    placewise_search,
+    same_ranking,
+)
+from lab.benchmarks.synthetic_map import (
     BLOCKS,
     SyntheticCity,
-    SyntheticMap,
     create_synthetic_map,
     required_memory_bytes,
 )
 from services.cli.main import build_app
+from services.search.snapshot import Snapshot
 from services.search.worker import SearchWorker
 from shared.storage.chunks import Row, Rows
 
@@ -37,17 +41,6 @@ def rows_of(seed: int, count: int, dimension: int = 64) -> Rows:
     rows = np.random.default_rng(seed).standard_normal((count, dimension))
     found: Rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
     return found
-
-
-@contextlib.contextmanager
-def world_of(
-    home: Path, city: SyntheticCity, photos: int, chunk_rows: int
-) -> Iterator[SyntheticMap]:
-    budget = required_memory_bytes(photos, city.dimension)
-    with create_synthetic_map(home, city.dimension, search_memory_budget=budget) as world:
-        for rows in city.chunks(photos, chunk_rows):
-            world.add(rows)
-        yield world
 
 
 def test_descriptors_have_the_structure_of_vlad() -> None:
@@ -90,7 +83,7 @@ def test_the_same_seed_makes_the_same_city_whatever_the_chunks() -> None:
 def test_brute_force_orders_equal_photos_by_their_ids() -> None:
     rows = rows_of(1, 6)
     rows[4] = rows[1]
-    oracle = BruteForce.of((rows[:4], rows[4:]), IDS, rows[1:2] * np.float32(3))
+    oracle = BruteForce((rows[:4], rows[4:]), IDS, rows[1:2] * np.float32(3))
     best = oracle.best(0, 2)
     assert [photo_id for photo_id, _ in best] == [IDS[1], IDS[4]]
     assert best[0][1] == pytest.approx(1, abs=1e-6)
@@ -144,11 +137,9 @@ def test_growth_is_measured_by_the_size_of_the_map() -> None:
     assert figures["growth: scan of 3,000 codes, p50"] > 0
 
 
-def test_a_wrong_answer_of_ours_is_a_missed_figure(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def with_last_two_exchanged(world: SyntheticMap, worker: SearchWorker) -> SearchMethod:
-        right = placewise_search(world, worker)
+def test_a_wrong_answer_of_ours_is_a_missed_figure(tmp_path: Path) -> None:
+    def with_last_two_exchanged(worker: SearchWorker, snapshot: Snapshot) -> SearchMethod:
+        right = placewise_search(worker, snapshot)
 
         def search(query: Row, k: int, min_score: float | None) -> Ranking:
             found = list(right(query, k, min_score))
@@ -156,11 +147,17 @@ def test_a_wrong_answer_of_ours_is_a_missed_figure(
 
         return search
 
-    monkeypatch.setattr(comparison, "placewise_search", with_last_two_exchanged)
-    city = SyntheticCity(512, 1)
-    with world_of(tmp_path, city, 60, 60) as world, Progress(disable=True) as progress:
-        compared = compare_methods(world, city, 2, progress)
-    report = Report("anything")
-    report_comparison(report, compared)
+    city, report = SyntheticCity(512, 1), Report("anything")
+    budget = required_memory_bytes(60, city.dimension)
+    with (
+        create_synthetic_map(tmp_path, city.dimension, search_memory_budget=budget) as world,
+        Progress(disable=True) as progress,
+    ):
+        for rows in city.chunks(60, 60):
+            world.add(rows)
+        compare_methods(report, world, city, 2, progress, with_last_two_exchanged)
     assert report.missed
-    assert compared.wrong[MATCHED_CASE.name, PLACEWISE] == 2
+    (compared,) = report.details["comparisons"]
+    assert {"case": MATCHED_CASE.name, "method": PLACEWISE, "wrong": 2}.items() <= (
+        compared["rows"][0].items()
+    )

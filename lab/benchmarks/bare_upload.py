@@ -1,6 +1,6 @@
 """Minimal FastAPI upload server, the baseline of `placewise bench pipeline`: stores a file in S3.
 
-    python -m lab.benchmarks.fleet.bare_upload PORT    (with the S3_ settings in the environment)
+    python -m lab.benchmarks.bare_upload PORT    (with the S3_ settings in the environment)
 
 It does not validate, count, hash or record anything.
 """

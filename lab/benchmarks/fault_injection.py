@@ -74,13 +74,15 @@ class FaultProxy:
     def in_mode(self, mode: ProxyMode, *, cut_after_bytes: int = CUT_AFTER_BYTES) -> Iterator[None]:
         """Context manager that sets the mode."""
         self._cut_after_bytes = cut_after_bytes
-        self._set(mode)
+        self.set_mode(mode)
         try:
             yield
         finally:
-            self._set(ProxyMode.OPEN)
+            self.set_mode(ProxyMode.OPEN)
 
-    def _set(self, mode: ProxyMode) -> None:
+    def set_mode(self, mode: ProxyMode) -> None:
+        """Set the mode, which closes the open connections."""
+
         async def change() -> None:
             self._mode = mode
             await self._drop_all()
