@@ -43,11 +43,6 @@ class StewardMetrics:
         self.wakeups_resent = counter("wakeups_resent", "Wakeups sent again for waiting jobs.")
         self.slots_merged = counter("slots_merged", "Slots whose chunks were merged into one.")
         self.journal_lines = counter("journal_lines", "Catalog rows written to the journal.")
-        self.catalog_lag_segments = gauge(
-            "catalog_lag_segments",
-            "Journal segments in the object store that the catalog does not know: 0, unless an "
-            "older catalog was restored.",
-        )
         self.objects_deleted = counter(
             "objects_deleted", "Deleted objects that nothing referred to any more.", ["task"]
         )

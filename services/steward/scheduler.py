@@ -26,7 +26,6 @@ import services.steward.tasks.model_changes
 import services.steward.tasks.reindex_jobs  # noqa: F401  (they register their tasks)
 from services.steward.metrics import StewardMetrics
 from services.steward.periodic_tasks import PeriodicTask, registered_tasks
-from services.steward.tasks.journal import JournalTask
 from services.steward.tasks.orphans import (
     CollectionHeld,
     collect_orphans,
@@ -38,6 +37,7 @@ from shared.catalog.database.session import IDLE_SECONDS, Catalog, ChangePoll
 from shared.config.disk_space import DiskReserve
 from shared.config.settings import Settings
 from shared.jobs import Wakeups
+from shared.journal.outbox import write_journal, write_snapshot
 from shared.storage import ObjectStore, OwnedStore
 from shared.storage.read_retries import ReadRetries
 from shared.telemetry.heartbeat import Heartbeat
@@ -95,10 +95,18 @@ class Scheduler:
             "retries": ReadRetries(),
             "queued_chunks": {},
         }
-        self._journal = PeriodicTask("write_journal", 2.0, JournalTask(catalog, store, metrics))
+        self._journal = PeriodicTask(
+            "write_journal",
+            2.0,
+            lambda: write_journal(catalog, store),
+            counter="journal_lines",
+        )
         self.tasks = [
             *registered_tasks(resources, counting_store),
             self._journal,
+            PeriodicTask(
+                "write_snapshot", 3600.0, lambda: write_snapshot(catalog, store), own_thread=True
+            ),
             PeriodicTask(
                 "collect_orphans",
                 3600.0,

@@ -268,7 +268,8 @@ class WebhookDispatcher:
             session.flush()
             for delivery in claimed:
                 session.refresh(delivery)
-            return session.get(Webhook, webhook_id), claimed
+            live = select(Webhook).where(Webhook.id == webhook_id, Webhook.deleted_at.is_(None))
+            return session.scalar(live), claimed
 
     async def _attempt(self, webhook: Webhook | None, delivery: Delivery) -> None:
         if webhook is None:  # deleted while the event was being written

@@ -16,6 +16,7 @@ from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.database.base import (
     Base,
+    Journaled,
     JsonValue,
     UtcDateTime,
     count_rows,
@@ -33,7 +34,7 @@ from shared.security.api_keys import Scope, api_key_prefix, generate_api_key, ha
 LAST_USED_RESOLUTION_SECONDS = 60.0  # of `last_used_at`
 
 
-class ApiKey(Base):
+class ApiKey(Journaled, Base):
     """An API key. A limit that is null defaults to the one of the settings."""
 
     __tablename__ = "api_keys"
@@ -171,7 +172,8 @@ def record_key_use(session: Session, key_id: UUID) -> None:
                 ApiKey.last_used_at < db_now_plus(-LAST_USED_RESOLUTION_SECONDS),
             ),
         )
-        .values(last_used_at=db_now())
+        # `revision` is set explicitly: otherwise the journal would record each use.
+        .values(last_used_at=db_now(), revision=ApiKey.revision)
         .execution_options(synchronize_session=False)
     )
 

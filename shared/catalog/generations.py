@@ -129,7 +129,7 @@ def list_generations(session: Session, map_id: UUID) -> list[Generation]:
     return list_newest(session, Generation, Generation.map_id == map_id)
 
 
-class Evaluation(Base):
+class Evaluation(Journaled, Base):
     """The metrics of an evaluation; `searchable` is the number of searchable photos back then."""
 
     __tablename__ = "evaluations"

@@ -2,8 +2,8 @@
 
 Objects that a catalog does not refer to are collected as orphans, so a store must belong to exactly
 one catalog. The store has a mark with the catalog's id (`shared.storage.ownership`), and the
-catalog stores its bucket. A restored backup of the catalog has the same id and still owns the
-store.
+catalog stores its bucket. An older copy of the catalog has the same id, but does not know the
+numbers of the journal's last segments (`check_not_behind`).
 """
 
 from __future__ import annotations
@@ -22,11 +22,13 @@ from shared.catalog.models import Model
 from shared.catalog.photos import Photo
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.config.settings import Settings
+from shared.errors import Misconfigured
 from shared.ids import new_id
-from shared.storage import OwnedStore
+from shared.storage import ObjectStore, OwnedStore
 from shared.storage.keys import OWNER_MARK
 from shared.storage.open_store import open_store
 from shared.storage.ownership import BucketLocation, bucket_location, check_free, claim_store
+from shared.storage.segments import Segment, list_segments
 
 SAMPLE_KEYS = 20  # per table
 REBUILDING = -1  # special value of `Installation.journal_sequence`
@@ -41,8 +43,8 @@ class Installation(Base):
     id: Mapped[UUID] = mapped_column(Uuid, default=new_id)
     # Endpoint and name of the bucket with the objects; null if they are in a folder.
     bucket: Mapped[BucketLocation | None] = mapped_column(JsonValue)
-    # Number of the last journal segment that this catalog has written (`shared.journal`), or
-    # REBUILDING until `placewise storage rebuild` has finished.
+    # Number that this catalog has taken for its last journal segment (`shared.journal`), or
+    # REBUILDING until a rebuild has finished.
     journal_sequence: Mapped[int] = mapped_column(BigInteger, default=0, server_default="0")
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
 
@@ -55,10 +57,10 @@ def get_or_create_installation(session: Session) -> Installation:
 
 
 def open_installation_store(catalog: Catalog, settings: Settings, *, exclusive: bool) -> OwnedStore:
-    """Open the object store of the settings after checking that it belongs to this catalog.
+    """Open the object store of the settings after checking that this catalog is the right one.
 
     Raises:
-        Misconfigured: As `open_store` and `claim_store` raise.
+        Misconfigured: As `open_store`, `claim_store` and `check_not_behind` raise.
         Unavailable: The bucket can't be used right now.
     """
     store = open_store(settings, exclusive=exclusive)
@@ -74,7 +76,43 @@ def open_installation_store(catalog: Catalog, settings: Settings, *, exclusive: 
     if place != installation.bucket:
         with catalog.write() as session:
             get_or_create_installation(session).bucket = place
+    check_not_behind(catalog, store)
     return store
+
+
+def check_not_behind(catalog: Catalog, store: ObjectStore) -> list[Segment]:
+    """Check that the catalog is not older than its object store; return the journal's segments.
+
+    With an older one, later photos would be collected as orphans, and its changes would count as
+    older than those in the journal.
+
+    Raises:
+        Misconfigured: `rebuild_unfinished`; `catalog_behind`.
+        Unavailable: As the store.
+    """
+    segments = list_segments(store)
+    # Read after listing: a number is taken before its segment is written.
+    with catalog.read() as session:
+        sequence = session.scalar(select(Installation.journal_sequence)) or 0
+    if sequence == REBUILDING:
+        raise Misconfigured(
+            "rebuild_unfinished",
+            "The rebuild of the catalog was interrupted. Run the same command again (`placewise "
+            "storage rebuild`, or `placewise restore`).",
+        )
+    later = [segment for segment in segments if segment.last > sequence]
+    if later:
+        since = min(segment.modified_at for segment in later)
+        raise Misconfigured(
+            "catalog_behind",
+            f"The catalog is older than its object store, which has changes since "
+            f"{since:%Y-%m-%d %H:%M:%S} UTC that it lacks. Nothing was changed. Restore the newer "
+            "catalog; or create it from the object store: stop all services, let DATABASE_URL name "
+            "an empty database (or move catalog.sqlite and its -wal and -shm files away), and run "
+            "`placewise storage rebuild`. To continue without those changes: `placewise storage "
+            "adopt`.",
+        )
+    return segments
 
 
 def check_before_new_catalog(catalog: Catalog, settings: Settings) -> None:
@@ -91,11 +129,14 @@ def check_before_new_catalog(catalog: Catalog, settings: Settings) -> None:
 
 
 def adopt_store(catalog: Catalog, store: OwnedStore) -> None:
-    """Make this catalog the owner of the store, also if another catalog owns it."""
+    """Make this catalog the owner of the store, also if another or a newer catalog owns it."""
+    last = max((segment.last for segment in list_segments(store)), default=0)
     with catalog.write() as session:
         installation = get_or_create_installation(session)
         store.write_note(OWNER_MARK, str(installation.id).encode())
         installation.bucket = bucket_location(store)
+        if installation.journal_sequence != REBUILDING:
+            installation.journal_sequence = max(installation.journal_sequence, last)
 
 
 def _sample_referenced_keys(catalog: Catalog) -> list[str]:

@@ -20,6 +20,7 @@ from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.database.base import (
     Base,
+    Journaled,
     JsonValue,
     UtcDateTime,
     db_now,
@@ -46,8 +47,11 @@ class DeliveryState(StrEnum):
     FAILED = "failed"  # no more attempts
 
 
-class Webhook(Base):
-    """A webhook. Its secret signs the events, so it is stored in plain text."""
+class Webhook(Journaled, Base):
+    """A webhook. Its secret signs the events, so it is stored in plain text, also in the journal.
+
+    A deleted one keeps its row, without the secret: the journal records its deletion.
+    """
 
     __tablename__ = "webhooks"
 
@@ -56,6 +60,7 @@ class Webhook(Base):
     events: Mapped[list[str]] = mapped_column(JsonValue)
     secret: Mapped[str] = mapped_column(Text)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
+    deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
 
 class Delivery(Base):
@@ -105,21 +110,21 @@ def create_webhook(session: Session, url: str, events: list[EventKind]) -> Webho
 def get_webhook(session: Session, webhook_id: UUID) -> Webhook:
     """Return a webhook; NotFound (`webhook_not_found`)."""
     webhook = session.get(Webhook, webhook_id)
-    if webhook is None:
+    if webhook is None or webhook.deleted_at is not None:
         raise NotFound("webhook_not_found", f"There is no webhook {webhook_id}.")
     return webhook
 
 
 def list_webhooks(session: Session) -> list[Webhook]:
     """List all webhooks, newest first."""
-    return list_newest(session, Webhook)
+    return list_newest(session, Webhook, Webhook.deleted_at.is_(None))
 
 
 def delete_webhook(session: Session, webhook_id: UUID) -> Webhook:
     """Delete a webhook with all its deliveries, also pending ones; NotFound."""
     webhook = get_webhook(session, webhook_id)
     session.execute(delete(Delivery).where(Delivery.webhook_id == webhook_id))
-    session.delete(webhook)
+    webhook.secret, webhook.deleted_at = "", db_now()
     return webhook
 
 
@@ -137,7 +142,8 @@ def subscribed_webhook_ids(session: Session, event: EventKind) -> list[UUID]:
     if webhooks is None:
         # The caller's changes may be incomplete, so they must not be flushed here.
         with session.no_autoflush:
-            webhooks = session.execute(select(Webhook.id, Webhook.events)).all()
+            live = select(Webhook.id, Webhook.events).where(Webhook.deleted_at.is_(None))
+            webhooks = session.execute(live).all()
         session.info["webhooks"] = webhooks
     return [webhook_id for webhook_id, events in webhooks if event in events]
 

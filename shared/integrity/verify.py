@@ -9,9 +9,8 @@ their originals.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
@@ -39,8 +38,9 @@ from shared.integrity.referenced_objects import (
 from shared.jobs.transitions import requeue_job_as_new
 from shared.jobs.wakeups import Wakeups
 from shared.storage import ObjectStore
-from shared.storage.chunks import decode_rows, manifest_key, rows_are_valid
+from shared.storage.chunks import decode_rows, manifest_key, read_manifest, rows_are_valid
 from shared.storage.copying import hash_object
+from shared.storage.keys import object_not_found_error
 
 
 class FaultKind(StrEnum):
@@ -83,70 +83,6 @@ class IntegrityReport:
     trash_bytes: int = 0
 
 
-def _verify_chunk(
-    store: ObjectStore,
-    chunk_id: UUID,
-    object_key: str,
-    sha256: str,
-    rows: int,
-    catalog_rows: list[tuple[int, UUID]],
-    report: IntegrityReport,
-) -> Iterator[IntegrityFault]:
-    """Compare a chunk with its hash, its manifest and the catalog.
-
-    Args:
-        chunk_id, object_key, sha256, rows: the chunk in the catalog.
-        catalog_rows: (row, photo id) of each of its photos in the catalog.
-
-    Yields:
-        The first fault; nothing for an intact chunk.
-    """
-    manifest = manifest_key(object_key)
-    try:
-        data = store.get(object_key)
-    except NotFound:
-        yield IntegrityFault(
-            FaultKind.MISSING, "chunk", object_key, "it is not in the store", chunk_id
-        )
-        return
-    report.checked["chunk"] += 1
-    report.read_bytes += len(data)
-    if hashlib.sha256(data).hexdigest() != sha256:
-        yield IntegrityFault(FaultKind.DAMAGED, "chunk", object_key, "its hash differs", chunk_id)
-        return
-    vectors = decode_rows(data)
-    if len(vectors) != rows or not rows_are_valid(vectors).all():
-        detail = f"it has {len(vectors)} of {rows} rows, or rows that are not unit vectors"
-        yield IntegrityFault(FaultKind.DIFFERENT, "chunk", object_key, detail, chunk_id)
-        return
-    try:
-        content = json.loads(store.get(manifest))
-        photo_ids = [UUID(photo_id) for photo_id in content["photo_ids"]]
-        matches_chunk = content["sha256"] == sha256 and len(photo_ids) == rows
-    except NotFound:
-        yield IntegrityFault(
-            FaultKind.MISSING, "manifest", manifest, "it is not in the store", chunk_id
-        )
-        return
-    except (ValueError, KeyError, TypeError, AttributeError):
-        yield IntegrityFault(FaultKind.DAMAGED, "manifest", manifest, "it can't be read", chunk_id)
-        return
-    report.checked["manifest"] += 1
-    if not matches_chunk:
-        yield IntegrityFault(
-            FaultKind.DIFFERENT, "manifest", manifest, "it belongs to another chunk", chunk_id
-        )
-        return
-    misplaced = [
-        photo_id
-        for row, photo_id in catalog_rows
-        if not 0 <= row < rows or photo_ids[row] != photo_id
-    ]
-    if misplaced:
-        detail = f"{len(misplaced)} photos have another row in the catalog, first {misplaced[0]}"
-        yield IntegrityFault(FaultKind.DIFFERENT, "chunk", object_key, detail, chunk_id)
-
-
 VerifyProgress = Callable[[str, int, int], object]
 """Progress callback: kind of objects, number done, total."""
 
@@ -167,107 +103,117 @@ def verify_store(
         Unavailable: the catalog or the store is unavailable.
         SQLAlchemyError: as the catalog does.
     """
-    report = IntegrityReport()
+    verifier = _Verifier(catalog, store, originals=originals)
     with catalog.read() as session:
         referenced = list(list_referenced_objects(session))
-    total = {what: sum(one.what == what for one in referenced) for what in ObjectKind}
-    done: dict[ObjectKind, int] = dict.fromkeys(ObjectKind, 0)
+    total, done = Counter(one.what for one in referenced), Counter[ObjectKind]()
+    faults = []
     for one in referenced:
-        faults = list(_verify_object(catalog, store, one, originals, report))
-        if faults and _is_still_referenced(catalog, one):
-            report.faults += faults
+        if one.what != ObjectKind.MANIFEST:  # verified with its chunk
+            faults += filter(None, [verifier.verify(one)])
         done[one.what] += 1
         progress(plural(one.what), done[one.what], total[one.what])
     with catalog.read() as session:
-        report.faults += _find_missing_descriptors(session)
-    return report
+        present = {one.key for one in list_referenced_objects(session)} if faults else set()
+        verifier.report.faults = [
+            *(fault for fault in faults if fault.name in present),
+            *_find_missing_descriptors(session),
+        ]
+    return verifier.report
 
 
-def _verify_object(
-    catalog: Catalog,
-    store: ObjectStore,
-    one: ReferencedObject,
-    originals: bool,
-    report: IntegrityReport,
-) -> Iterator[IntegrityFault]:
-    if one.what == ObjectKind.MANIFEST:
-        return  # verified with its chunk
-    if one.what == ObjectKind.CHUNK:
-        with catalog.read() as session:
+class _Verifier:
+    """Verifies single objects and counts them in `report`."""
+
+    def __init__(self, catalog: Catalog, store: ObjectStore, *, originals: bool) -> None:
+        self._catalog = catalog
+        self._store = store
+        self._read_kinds = {ObjectKind.MODEL} | ({ObjectKind.ORIGINAL} if originals else set())
+        self.report = IntegrityReport()
+
+    def verify(self, one: ReferencedObject) -> IntegrityFault | None:
+        """Return the first fault of an object, if any."""
+        wrong = None
+        try:
+            if one.what == ObjectKind.CHUNK:
+                return self._verify_chunk(one)
+            if one.what == ObjectKind.VOCABULARY:
+                return self._verify_vocabulary(one)
+            if one.what in self._read_kinds:
+                size_bytes, sha256 = hash_object(self._store, one.key)
+                self.report.read_bytes += size_bytes
+                if sha256 != one.sha256:
+                    wrong = f"{one.what} {one.row_id}: its hash differs"
+            elif (info := self._store.head(one.key)) is None:
+                raise object_not_found_error(one.key)
+            elif one.size_bytes not in (None, info.size_bytes):
+                wrong = f"it has {info.size_bytes} bytes instead of {one.size_bytes}"
+        except NotFound as error:
+            key = str(error.extra["key"])
+            what = ObjectKind.MANIFEST if key == manifest_key(one.key) else one.what
+            chunk_id = one.row_id if one.what == ObjectKind.CHUNK else None
+            return IntegrityFault(FaultKind.MISSING, what, key, "it is not in the store", chunk_id)
+        self.report.checked[one.what] += 1
+        return IntegrityFault(FaultKind.DAMAGED, one.what, one.key, wrong) if wrong else None
+
+    def _verify_chunk(self, one: ReferencedObject) -> IntegrityFault | None:
+        """Compare a chunk with its hash, its manifest and the catalog."""
+        with self._catalog.read() as session:
             chunk = session.get(Chunk, one.row_id)
             if chunk is None:
-                return
+                return None
             catalog_rows = session.execute(
                 select(Descriptor.row, Descriptor.photo_id).where(Descriptor.chunk_id == chunk.id)
             ).all()
-        rows = [(row, photo_id) for row, photo_id in catalog_rows]
-        yield from _verify_chunk(
-            store, chunk.id, chunk.object_key, chunk.sha256, chunk.rows, rows, report
-        )
-        return
-    if one.what == ObjectKind.MODEL or (one.what == ObjectKind.ORIGINAL and originals):
-        yield from _verify_content(store, one, report)
-        return
-    info = store.head(one.key)
-    if info is None:
-        yield IntegrityFault(FaultKind.MISSING, one.what, one.key, "it is not in the store")
-        return
-    report.checked[one.what] += 1
-    if one.size_bytes is not None and info.size_bytes != one.size_bytes:
-        detail = f"it has {info.size_bytes} bytes instead of {one.size_bytes}"
-        yield IntegrityFault(FaultKind.DAMAGED, one.what, one.key, detail)
-    elif one.what == ObjectKind.VOCABULARY:
-        yield from _verify_vocabulary(catalog, store, one, report)
 
+        def fault(kind: FaultKind, detail: str, *, of_manifest: bool = False) -> IntegrityFault:
+            what = ObjectKind.MANIFEST if of_manifest else ObjectKind.CHUNK
+            key = manifest_key(one.key) if of_manifest else one.key
+            return IntegrityFault(kind, what, key, detail, chunk.id)
 
-def _verify_content(
-    store: ObjectStore, one: ReferencedObject, report: IntegrityReport
-) -> Iterator[IntegrityFault]:
-    try:
-        size_bytes, sha256 = hash_object(store, one.key)
-    except NotFound:
-        yield IntegrityFault(FaultKind.MISSING, one.what, one.key, "it is not in the store")
-        return
-    report.read_bytes += size_bytes
-    report.checked[one.what] += 1
-    if sha256 != one.sha256:
-        yield IntegrityFault(
-            FaultKind.DAMAGED, one.what, one.key, f"{one.what} {one.row_id}: its hash differs"
-        )
+        data = self._store.get(one.key)
+        self.report.checked["chunk"] += 1
+        self.report.read_bytes += len(data)
+        if hashlib.sha256(data).hexdigest() != chunk.sha256:
+            return fault(FaultKind.DAMAGED, "its hash differs")
+        vectors = decode_rows(data)
+        if len(vectors) != chunk.rows or not rows_are_valid(vectors).all():
+            detail = (
+                f"it has {len(vectors)} of {chunk.rows} rows, or rows that are not unit vectors"
+            )
+            return fault(FaultKind.DIFFERENT, detail)
+        manifest = read_manifest(self._store, one.key)
+        if manifest is None:
+            return fault(FaultKind.DAMAGED, "it can't be read", of_manifest=True)
+        self.report.checked["manifest"] += 1
+        if manifest.sha256 != chunk.sha256 or len(manifest.photo_ids) != chunk.rows:
+            return fault(FaultKind.DIFFERENT, "it belongs to another chunk", of_manifest=True)
+        misplaced = [
+            photo_id
+            for row, photo_id in catalog_rows
+            if not 0 <= row < chunk.rows or manifest.photo_ids[row] != photo_id
+        ]
+        if misplaced:
+            detail = (
+                f"{len(misplaced)} photos have another row in the catalog, first {misplaced[0]}"
+            )
+            return fault(FaultKind.DIFFERENT, detail)
+        return None
 
-
-def _verify_vocabulary(
-    catalog: Catalog, store: ObjectStore, one: ReferencedObject, report: IntegrityReport
-) -> Iterator[IntegrityFault]:
-    with catalog.read() as session:
-        stored = session.get(Vocabulary, one.row_id)
-    if stored is None:
-        return
-    try:
-        data = store.get(one.key)
-    except NotFound:  # deleted with its map since `head`
-        yield IntegrityFault(FaultKind.MISSING, one.what, one.key, "it is not in the store")
-        return
-    report.read_bytes += len(data)
-    try:
-        intact = hashlib.sha256(decode_rows(data).tobytes()).hexdigest() == stored.sha256
-    except (ValueError, KeyError):  # its header is damaged
-        intact = False
-    if not intact:
-        yield IntegrityFault(
-            FaultKind.DAMAGED, one.what, one.key, "its centres are not those that were stored"
-        )
-
-
-def _is_still_referenced(catalog: Catalog, one: ReferencedObject) -> bool:
-    with catalog.read() as session:
-        if one.what in (ObjectKind.CHUNK, ObjectKind.MANIFEST):
-            chunk = session.get(Chunk, one.row_id)
-            return chunk is not None and chunk.superseded_at is None
-        if one.what == ObjectKind.ORIGINAL:
-            photo = session.get(Photo, one.row_id)
-            return photo is not None and photo.deleted_at is None
-        return any(now.key == one.key for now in list_referenced_objects(session))
+    def _verify_vocabulary(self, one: ReferencedObject) -> IntegrityFault | None:
+        with self._catalog.read() as session:
+            stored = session.get(Vocabulary, one.row_id)
+        if stored is None:
+            return None
+        data = self._store.get(one.key)
+        self.report.checked[one.what] += 1
+        self.report.read_bytes += len(data)
+        try:
+            intact = hashlib.sha256(decode_rows(data).tobytes()).hexdigest() == stored.sha256
+        except (ValueError, KeyError):  # its header is damaged
+            intact = False
+        detail = "its centres are not those that were stored"
+        return None if intact else IntegrityFault(FaultKind.DAMAGED, one.what, one.key, detail)
 
 
 def _find_missing_descriptors(session: Session) -> list[IntegrityFault]:

@@ -1,11 +1,13 @@
-"""The journal: the state of photos, maps and models, written to the object store.
+"""The journal: the catalog's rows, written to the object store.
 
-A lost catalog can be rebuilt from it (`shared.rebuild`), and it shows when a catalog is older than
-its object store (`shared.journal.outbox`). It follows the transactional outbox pattern: every
-transaction that changes a row of `TABLES` marks the row (`shared.catalog.database.base`), and the
-steward writes marked rows to the store as the next *segment*, then clears the marks.
+A catalog is rebuilt from it (`services.cli.recovery`). It has two parts:
 
-A line of a segment is the complete state of a row, with the row's revision. Among several lines of
-one row the highest revision counts. So the order of segments does not matter, and a line may be
-written twice, by two stewards or after one was killed.
+- *Segments* are a log of the tables in `TABLES`. They follow the transactional outbox pattern:
+  every transaction that changes a row marks it (`shared.catalog.database.base`), and the steward
+  writes marked rows as the next segment, then clears the marks. A line is the complete state of a
+  row, with its revision; among several lines of one row the highest revision counts. So the order
+  of segments does not matter, and a line may be written twice.
+- The *snapshot* is a copy of the other tables that outlive a process (`SNAPSHOT_TABLES`), and of
+  the marked rows. The steward replaces it from time to time, and every backup ends with one. The
+  rows of a snapshot after which no segment was written are the state of the whole catalog.
 """

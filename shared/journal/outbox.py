@@ -1,208 +1,114 @@
-"""Writes pending rows to the journal, and detects a catalog that is older than its object store.
-
-The journal's sequence numbers show the lag: see `catalog_lag`.
-"""
+"""Writes the journal: pending rows as segments, and snapshots."""
 
 from __future__ import annotations
 
-import logging
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass
-from datetime import datetime
+from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
-from sqlalchemy import bindparam, exists, literal, select, union_all, update
+from sqlalchemy import Select, bindparam, exists, literal, or_, select, union_all, update
 from sqlalchemy.orm import Session
 
-from shared.catalog.database.session import Catalog
-from shared.catalog.installation import REBUILDING, Installation, get_or_create_installation
-from shared.errors import NotFound, Unavailable
+from shared.catalog.batch_items import BatchItem
+from shared.catalog.database.session import NO_TIMEOUTS, Catalog
+from shared.catalog.installation import (
+    Installation,
+    check_not_behind,
+    get_or_create_installation,
+)
+from shared.catalog.jobs import QUERY_JOBS, Job, JobKind, JobState
 from shared.journal.segments import (
     MIN_SEGMENTS_TO_MERGE,
+    SNAPSHOT_TABLES,
     TABLES,
     Line,
-    Segment,
     line_of,
-    list_segments,
     merge_segments,
-    put_segment,
-    read_segment,
+    put_lines,
     table_of,
 )
 from shared.storage import ObjectStore
-
-log = logging.getLogger(__name__)
-
-ROWS_PER_STATEMENT = 500
-MAX_LIST_ATTEMPTS = 5  # when segments are merged meanwhile
-
-# Tables whose rows may be deleted without a line in the journal: unused whitenings.
-UNJOURNALED_DELETES = {"whitenings"}
-
-
-@dataclass(frozen=True, slots=True)
-class Lag:
-    """How far a catalog is behind the journal of its object store."""
-
-    segments: int
-    """Upper bound of the journal segments with changes unknown to the catalog."""
-    since: datetime | None
-    """When the first of them was written; None for an unfinished rebuild."""
-
-    @property
-    def detail(self) -> str:
-        """Message for the operator: what happened and what to do."""
-        if self.since is None:
-            return (
-                "`placewise storage rebuild` was interrupted. Run it again to resume it. Until "
-                "then, nothing is deleted from the object store."
-            )
-        return (
-            f"The catalog is older than the object store: up to {self.segments} journal segments, "
-            f"the first written at {self.since:%Y-%m-%d %H:%M:%S} UTC, contain changes that it "
-            "lacks. Restore the newer catalog; or run `placewise verify --repair`, which recovers "
-            "the missing photos. Until then, nothing is deleted from the object store."
-        )
-
-
-def catalog_lag(catalog: Catalog, store: ObjectStore) -> Lag | None:
-    """Return the lag of a catalog; None when it has all changes in the journal.
-
-    A segment whose number the catalog lacks, but whose rows it has, is no lag: a steward was killed
-    between writing the segment and its commit.
-
-    Raises:
-        Unavailable: as the store; `journal_busy`.
-    """
-    return _lag_of(catalog, store, list_segments(store))
-
-
-def _lag_of(catalog: Catalog, store: ObjectStore, segments: list[Segment]) -> Lag | None:
-    """Return the lag as `catalog_lag`, for segments that were just listed."""
-    for _ in range(MAX_LIST_ATTEMPTS):
-        # Read after listing: segments that other stewards have written since are no lag.
-        with catalog.read() as session:
-            sequence = session.scalar(select(Installation.journal_sequence)) or 0
-        if sequence == REBUILDING:
-            return Lag(len(segments), None)
-        try:
-            for segment in segments:
-                if segment.last > sequence and not _knows_segment(catalog, store, segment):
-                    return Lag(max(s.last for s in segments) - sequence, segment.modified_at)
-        except NotFound:  # merged meanwhile
-            segments = list_segments(store)
-        else:
-            return None
-    raise Unavailable("journal_busy", "The journal's segments are being merged. Try again.")
-
-
-def _knows_segment(catalog: Catalog, store: ObjectStore, segment: Segment) -> bool:
-    try:
-        lines = read_segment(store, segment.key).lines
-    except Unavailable as error:
-        if error.code != "journal_damaged":
-            raise
-        return False
-    with catalog.read() as session:
-        return all(
-            _knows_rows(session, lines[begin : begin + ROWS_PER_STATEMENT])
-            for begin in range(0, len(lines), ROWS_PER_STATEMENT)
-        )
-
-
-def _knows_rows(session: Session, lines: list[Line]) -> bool:
-    for line, known in unknown_lines(session, lines):
-        deleted = line.table in UNJOURNALED_DELETES or line.row.get("deleted_at") is not None
-        if known is not None or not deleted:
-            return False
-    return True
-
-
-def unknown_lines(session: Session, lines: Iterable[Line]) -> list[tuple[Line, Line | None]]:
-    """Return the lines that differ from the catalog, each with the catalog's state of the row.
-
-    The state is None where the catalog has no such row. A row with a higher revision is newer than
-    the line, which is therefore not returned.
-    """
-    lines = list(lines)
-    unknown: list[tuple[Line, Line | None]] = []
-    for name in TABLES:
-        table_lines = {line.id: line for line in lines if line.table == name}
-        if not table_lines:
-            continue
-        table = table_of(name)
-        rows = session.execute(select(table).where(table.c.id.in_(list(table_lines)))).mappings()
-        present = {row["id"]: line_of(name, row) for row in rows}
-        for id_, line in table_lines.items():
-            known = present.get(id_)
-            if known is None or known.revision < line.revision:
-                unknown.append((line, known))
-            elif known.revision == line.revision:
-                common = known.row.keys() & line.row.keys()
-                if any(known.row[key] != line.row[key] for key in common):
-                    unknown.append((line, known))
-    return unknown
-
+from shared.storage.segments import list_segments, segment_key
 
 LINES_PER_SEGMENT = 5000
 TIME_LIMIT_SECONDS = 2.0  # so that the steward's other tasks run in time
+ROWS_PER_FETCH = 1000
 
 
-@dataclass(frozen=True, slots=True)
-class JournalWrite:
-    """Result of `write_journal`."""
+def write_journal(
+    catalog: Catalog, store: ObjectStore, *, min_segments_to_merge: int = MIN_SEGMENTS_TO_MERGE
+) -> int:
+    """Write pending rows for up to TIME_LIMIT_SECONDS; return their number.
 
-    lines: int
-    """Number of written lines."""
-    lag: Lag | None
-    """Set where pending rows were not written because the catalog is behind its store."""
-
-
-def write_journal(catalog: Catalog, store: ObjectStore) -> JournalWrite:
-    """Write pending rows for up to TIME_LIMIT_SECONDS; one query when none is pending.
-
-    A segment is written to the store first; then one transaction increments the catalog's sequence
-    number and clears the marks. A process that is killed in between leaves a segment whose rows
-    are still pending, so that they are written again. A catalog that is behind its store writes
-    nothing.
+    The catalog takes the segment's number first, then the segment is written to the store, then the
+    marks are cleared. A process that is killed in between leaves rows pending, which are written
+    again. Two processes that write the same rows do no harm.
 
     Raises:
+        Misconfigured: as `check_not_behind`; nothing is written then.
         Unavailable: as the store.
     """
     deadline, written = time.monotonic() + TIME_LIMIT_SECONDS, 0
     while True:
         with catalog.read() as session:
             lines = _pending(session)
-            sequence = session.scalar(select(Installation.journal_sequence)) or 0
         if not lines:
-            return JournalWrite(written, None)
-        segments = list_segments(store)
-        lag = _lag_of(catalog, store, segments)
-        if lag is not None:
-            return JournalWrite(written, lag)
-        # The number of a segment that a killed steward left behind is not reused.
-        number = max([sequence, *(segment.last for segment in segments)]) + 1
-        with catalog.write() as session:
-            installation_id = get_or_create_installation(session).id
-        key = put_segment(store, number, number, installation_id, (line.encode() for line in lines))
-        if not catalog.run(partial(_commit, before=sequence, number=number, lines=lines)):
-            store.delete(key)  # another steward was faster; rows it did not write are still pending
-            return JournalWrite(written, None)
+            return written
+        segments = check_not_behind(catalog, store)
+        number = _take_number(catalog)
+        put_lines(store, segment_key(number, number), lines)
+        catalog.run(partial(_clear_marks, lines=lines))
         written += len(lines)
-        if len(segments) + 1 >= MIN_SEGMENTS_TO_MERGE:
-            merge_segments(store, list_segments(store))
+        merge_segments(store, segments, min_segments_to_merge)
         if len(lines) < LINES_PER_SEGMENT or time.monotonic() > deadline:
-            return JournalWrite(written, None)
+            return written
 
 
-def accept_segments(catalog: Catalog, store: ObjectStore) -> None:
-    """Set the catalog's sequence number to the store's last segment, whoever wrote it."""
-    last = max((segment.last for segment in list_segments(store)), default=0)
+def write_snapshot(catalog: Catalog, store: ObjectStore) -> None:
+    """Replace the store's snapshot; raises as `write_journal`."""
+    check_not_behind(catalog, store)
+    number = _take_number(catalog)
+    with catalog.with_timeouts(NO_TIMEOUTS).read() as session:
+        put_lines(store, segment_key(number, number, snapshot=True), snapshot_lines(session))
+    for segment in list_segments(store):
+        if segment.is_snapshot and segment.last < number:
+            store.delete(segment.key)
+
+
+def snapshot_lines(session: Session) -> Iterator[Line]:
+    """Iterate over the lines of a snapshot: pending rows first, in the order of foreign keys."""
+    for name in (*TABLES, *SNAPSHOT_TABLES):
+        rows = session.execute(
+            _select_for_snapshot(name).execution_options(yield_per=ROWS_PER_FETCH)
+        )
+        yield from (line_of(name, row) for row in rows.mappings())
+
+
+def _select_for_snapshot(name: str) -> Select[Any]:
+    table = table_of(name)
+    if name in TABLES:
+        return select(table).where(table.c.revision != table.c.journaled_revision)
+    if name != Job.__tablename__:
+        return select(table)
+    # The photos of queries are not stored. A described photo needs no job, but the batch of a
+    # running item reads how its job has ended.
+    of_photo = Job.kind.in_((JobKind.INDEX, JobKind.REINDEX))
+    of_running_items = select(BatchItem.photo_job_id).where(BatchItem.state == JobState.RUNNING)
+    return select(table).where(
+        Job.kind.not_in(QUERY_JOBS),
+        or_(~of_photo, Job.state != JobState.SUCCEEDED, Job.id.in_(of_running_items)),
+    )
+
+
+def _take_number(catalog: Catalog) -> int:
     with catalog.write() as session:
-        installation = get_or_create_installation(session)
-        if installation.journal_sequence != REBUILDING:
-            installation.journal_sequence = max(installation.journal_sequence, last)
+        get_or_create_installation(session)
+        return session.execute(
+            update(Installation)
+            .values(journal_sequence=Installation.journal_sequence + 1)
+            .returning(Installation.journal_sequence)
+        ).scalar_one()
 
 
 def _pending(session: Session) -> list[Line]:
@@ -225,23 +131,6 @@ def _pending(session: Session) -> list[Line]:
         )
         lines += [line_of(name, row) for row in rows.mappings()]
     return lines
-
-
-def _commit(session: Session, before: int, number: int, lines: list[Line]) -> bool:
-    """Set the sequence number and clear the marks of the lines.
-
-    Returns False without a change when the sequence number is no longer `before`.
-    """
-    updated = session.execute(
-        update(Installation)
-        .where(Installation.journal_sequence == before)
-        .values(journal_sequence=number)
-        .returning(Installation.number)
-    ).all()
-    if not updated:
-        return False
-    _clear_marks(session, lines)
-    return True
 
 
 def _clear_marks(session: Session, lines: list[Line]) -> None:

@@ -154,6 +154,30 @@ def write_chunk(
     return WrittenChunk(object_key=key, rows=len(rows), size_bytes=len(data), sha256=sha256)
 
 
+@dataclass(frozen=True, slots=True)
+class ChunkManifest:
+    """What the manifest of a chunk says; `photo_ids` has the photo of each row."""
+
+    chunk_id: UUID
+    generation_id: UUID
+    sha256: str
+    photo_ids: list[UUID]
+
+
+def read_manifest(store: ObjectStore, object_key: str) -> ChunkManifest | None:
+    """Return the manifest of a chunk; None if it can't be read, NotFound if it is missing."""
+    try:
+        content = json.loads(store.get(manifest_key(object_key)))
+        return ChunkManifest(
+            UUID(content["chunk_id"]),
+            UUID(content["generation_id"]),
+            str(content["sha256"]),
+            [UUID(photo_id) for photo_id in content["photo_ids"]],
+        )
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
 def read_chunk(store: ObjectStore, object_key: str, sha256: str) -> StoredRows:
     """Read a chunk as stored, and verify its hash; Unavailable (`chunk_corrupt`) if it differs."""
     data = store.get(object_key)

@@ -91,8 +91,6 @@ class HoldReason(StrEnum):
     """More than MAX_ORPHAN_SHARE of all objects are orphans."""
     ADOPTED = "adopted"
     """A catalog adopted the store without knowing some of its objects."""
-    CATALOG_BEHIND = "catalog_behind"
-    """The catalog is older than the store."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +108,6 @@ class Hold:
         why = {
             HoldReason.SHARE: "they are more than a tenth of all objects",
             HoldReason.ADOPTED: "this catalog adopted the store without knowing them",
-            HoldReason.CATALOG_BEHIND: "the catalog is older than the store",
         }[self.reason]
         return (
             f"No row of the catalog references {self.orphans} of {self.objects} objects "

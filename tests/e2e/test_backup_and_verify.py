@@ -30,7 +30,7 @@ def test_a_running_server_is_backed_up_and_another_one_answers_as_it_did(
         )
     out = tmp_path / "backup"
     about = run(server.home, "backup", out)
-    assert about["rows"]["photos"] == 4
+    assert about["photos"] == 4
     assert about["missing"] == about["damaged"] == []
     query = photo_bytes(2)
     before = server.ask(query, top_k=3).json()["similar_images"]

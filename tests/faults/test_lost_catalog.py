@@ -153,16 +153,27 @@ def test_wrong_catalog_stops_every_start_and_no_object_is_touched(
     assert {info.key for info in filled.store.list("")} == before
 
 
-def test_older_catalog_deletes_no_original(filled: Filled) -> None:
-    before, originals = filled.stored_photos(), filled.originals()
+def test_older_catalog_stops_every_start_and_no_object_is_touched(filled: Filled) -> None:
+    before = {info.key for info in filled.store.list("")}
     filled.remove_catalog()
     shutil.copy(filled.older_catalog, filled.home / "catalog.sqlite")
+    for command in ("serve", "verify"):
+        done = filled.command(command)
+        assert done.returncode == 1
+        assert "catalog_behind" in done.stderr
+        assert "placewise storage rebuild" in done.stderr
+    assert {info.key for info in filled.store.list("")} == before
+
+
+def test_older_catalog_that_is_made_the_owner_deletes_no_original(filled: Filled) -> None:
+    originals = filled.originals()
+    filled.remove_catalog()
+    shutil.copy(filled.older_catalog, filled.home / "catalog.sqlite")
+    assert filled.command("storage", "adopt", "--confirm").returncode == 0
     with filled.server(**SETTINGS) as running:
         assert _searchable(running) == EARLY
         _wait_for_collection(running)
         assert _figures(running)["placewise_steward_collection_held"] == {(): 1}
-        assert running.stop() == 0
-    assert filled.stored_photos() == before
     assert filled.originals() == originals
 
 

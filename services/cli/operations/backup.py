@@ -1,8 +1,7 @@
 """`placewise storage backup`, `restore` and `rebuild`.
 
-A backup is a folder with the catalog's rows and the objects that they refer to. `rebuild`
-recovers a lost catalog from the object store alone. `maintenance` does the work; it is imported
-when a command runs.
+A backup is a copy of the object store, and a restore ends with a rebuild of the catalog from it.
+`maintenance` does the work; it is imported when a command runs.
 """
 
 from __future__ import annotations
@@ -23,14 +22,13 @@ from services.cli.output import (
     print_json,
     print_message,
     print_note,
-    print_result,
     progress_bar,
     stage_bars,
 )
 
 if TYPE_CHECKING:
-    from shared.backup.folder import BackupProgress
-    from shared.rebuild.recover import RecoveryReport
+    from services.cli.recovery.backup import BackupProgress
+    from services.cli.recovery.rebuild import RecoveryReport
 
 MAX_KEYS_SHOWN = 10
 
@@ -54,9 +52,8 @@ def backup(
         print_json(asdict(manifest))
     else:
         print_message(
-            f"Backed up {sum(manifest.rows.values())} rows and {manifest.objects} objects "
-            f"({manifest.object_bytes / 1e6:.1f} MB) to {out!s} as of "
-            f"{manifest.made_at}"
+            f"Backed up {manifest.photos} photos in {manifest.objects} objects "
+            f"({manifest.object_bytes / 1e6:.1f} MB) to {out!s} as of {manifest.made_at}"
         )
         for state, keys in (("missing", manifest.missing), ("damaged", manifest.damaged)):
             for key in keys[:MAX_KEYS_SHOWN]:
@@ -79,13 +76,12 @@ def restore(
     with progress_reporter() as progress:
         from services.cli.operations import maintenance
 
-        manifest, restored = maintenance.restore(read_settings(), source, progress)
-    print_result(
-        asdict(restored),
-        as_json,
-        f"Restored {restored.rows} rows and {restored.objects} objects as of {manifest.made_at}"
-        + (f"; cancelled {restored.cancelled_jobs} jobs" if restored.cancelled_jobs else ""),
-    )
+        restored = maintenance.restore(read_settings(), source, progress)
+    if as_json:
+        print_json(asdict(restored))
+        return
+    print_message(f"Restored {restored.objects} objects as of {restored.made_at}.")
+    print_recovered(restored.recovered)
 
 
 @contextlib.contextmanager
@@ -96,66 +92,61 @@ def progress_reporter() -> Iterator[BackupProgress]:
 
 
 NOT_RECOVERED_NOTE = (
-    "API keys, webhooks, jobs, the search history and evaluation reports are not stored in the "
-    "object store. Create keys and webhooks again."
+    "Unfinished batches and model changes, and the search history and tracks of the last hour, may "
+    "be missing."
 )
 
 
 def rebuild_catalog(as_json: JsonOption = False) -> None:
     """Rebuild a lost catalog from the object store. Stop all services first.
 
-    Recovers photos with their metadata, maps, generations and vocabularies. An interrupted rebuild
-    resumes when the command is run again.
+    Recovers photos with their metadata, maps, generations, vocabularies, API keys and webhooks. An
+    interrupted rebuild resumes when the command is run again.
     """
     with progress_reporter() as progress:
         from services.cli.operations.maintenance import rebuild
 
-        taken = rebuild(read_settings(), progress)
+        recovered = rebuild(read_settings(), progress)
     if as_json:
-        print_json(asdict(taken))
+        print_json(asdict(recovered))
         return
-    print_taken_in(taken)
+    print_recovered(recovered)
     print_note(NOT_RECOVERED_NOTE)
 
 
-def print_taken_in(taken: RecoveryReport) -> None:
+def print_recovered(report: RecoveryReport) -> None:
     """Print what was recovered into the catalog and what was not."""
     print_message(
-        f"Recovered {taken.photos + taken.unnamed_photos} photos in {taken.maps} new maps, with "
-        f"{taken.descriptors} descriptors in {taken.chunks} chunks, {taken.generations} "
-        f"generations and {taken.vocabularies} vocabularies. {taken.queued_photos} photos are "
+        f"Recovered {report.photos + report.unnamed_photos} photos in {report.maps} maps, with "
+        f"{report.descriptors} descriptors in {report.chunks} chunks, {report.generations} "
+        f"generations and {report.vocabularies} vocabularies. {report.queued_photos} photos are "
         "queued for description."
     )
-    if taken.changed_photos or taken.deleted_photos:
-        print_message(
-            f"The journal's changes were applied: {taken.changed_photos} photos updated, "
-            f"{taken.deleted_photos} deleted."
-        )
-    for old, new in taken.renamed_maps.items():
-        print_note(f"Another map is named {old}. The journal's map was renamed to {new}.")
-    if taken.unnamed_photos:
+    for old, new in report.renamed_maps.items():
+        print_note(f"Two maps were named {old}. The second one was renamed to {new}.")
+    if report.unnamed_photos:
         print_note(
-            f"{taken.unnamed_photos} photos are not in the journal. They were added to the map "
+            f"{report.unnamed_photos} photos are not in the journal. They were added to the map "
             "default with coordinates, heading and time from EXIF. Their file names, place labels, "
             "tags, metadata, roles and maps, and values that overrode EXIF, are lost."
         )
-    if taken.unnamed_descriptors:
+    if report.unnamed_descriptors:
         print_note(
-            f"{taken.unnamed_descriptors} descriptors belong to generations that are not in the "
+            f"{report.unnamed_descriptors} descriptors belong to generations that are not in the "
             "journal and can't be assigned to photos."
         )
-    if taken.lost_originals:
+    if report.lost_originals:
         print_note(
-            f"{taken.lost_originals} photos of the journal have no original in the store and were "
+            f"{report.lost_originals} photos of the journal have no original in the store and were "
             "not recovered: they were deleted just before the catalog was lost, or their files are "
             "missing."
         )
-    if taken.doubled_photos:
-        print_note(f"{taken.doubled_photos} photos are already stored under another ID.")
+    if report.doubled_photos:
+        print_note(f"{report.doubled_photos} photos are already stored under another ID.")
     for problem, keys in (
-        ("journal segments can't be read. Restore them from a backup", taken.damaged_segments),
-        ("chunks are damaged. Their photos will be described again", taken.damaged_chunks),
-        ("originals can't be decoded and were not recovered", taken.unreadable_originals),
+        ("journal segments can't be read. Restore them from a backup", report.damaged_segments),
+        ("chunks are damaged. Their photos will be described again", report.damaged_chunks),
+        ("originals can't be decoded and were not recovered", report.unreadable_originals),
     ):
         if keys:
             listed = ", ".join(keys[:MAX_KEYS_SHOWN])

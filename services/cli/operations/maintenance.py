@@ -1,7 +1,7 @@
 """Backup, recovery and repair of an installation, on its catalog and its object store directly.
 
-The commands in `backup` and `storage` import this module when they run. `shared.rebuild` is
-imported where it is used: it decodes photos, whose libraries not every image contains.
+The commands in `backup` and `storage` import this module when they run. The rebuild is imported
+where it is used: it reads photos, whose libraries not every image contains.
 """
 
 from __future__ import annotations
@@ -10,32 +10,35 @@ import contextlib
 import os
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+from uuid import UUID
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from services.cli.recovery.backup import (
+    BackupFolder,
+    BackupManifest,
+    BackupProgress,
+    create_backup,
+)
 from services.steward.tasks.orphans import StoreCount, collect_orphans, count_store, find_orphans
-from shared.backup.create import create_backup
-from shared.backup.folder import BackupManifest, BackupProgress, open_backup
-from shared.backup.restore import RestoreResult, restore_backup
 from shared.catalog.database.errors import explain_outage
 from shared.catalog.database.schema import check_schema, migrate, opening
 from shared.catalog.database.session import NO_TIMEOUTS, Catalog
 from shared.catalog.installation import (
     adopt_store,
+    check_not_behind,
     get_or_create_installation,
     open_installation_store,
 )
 from shared.catalog.tables import open_catalog
-from shared.config.embedded_home import find_running_server, lock_home
+from shared.config.embedded_home import lock_home
 from shared.config.settings import Settings
 from shared.errors import Conflict, Misconfigured
 from shared.integrity.verify import IntegrityReport, repair_descriptors, verify_store
 from shared.jobs import InProcessWakeups
-from shared.journal.outbox import Lag, catalog_lag
-from shared.storage import ObjectStore, OwnedStore
+from shared.storage import OwnedStore
 from shared.storage.open_store import open_store
 from shared.storage.ownership import read_owner
 from shared.storage.trash import (
@@ -48,9 +51,8 @@ from shared.storage.trash import (
 )
 
 if TYPE_CHECKING:
-    from shared.rebuild.recover import RecoveryReport
-
-UPLOAD_SECONDS = 3600.0  # an older original does not belong to an upload in progress
+    from services.cli.recovery.rebuild import RecoveryReport
+    from services.cli.recovery.restore import RestoreReport
 
 
 @contextlib.contextmanager
@@ -94,83 +96,71 @@ def back_up(settings: Settings, out: Path, progress: BackupProgress) -> BackupMa
         return create_backup(catalog, store, installation_id, out, progress)
 
 
-def restore(
-    settings: Settings, source: Path, progress: BackupProgress
-) -> tuple[BackupManifest, RestoreResult]:
-    """Restore the backup in the folder `source` into an empty installation.
+@contextlib.contextmanager
+def _open_new_catalog(settings: Settings, command: str) -> Iterator[tuple[Catalog, OwnedStore]]:
+    """Open the catalog, with its tables created, and a store that may not be its own yet.
+
+    Afterwards the store belongs to it.
 
     Raises:
-        PlacewiseError: As `open_backup`, `lock_home`, `migrate` and `restore_backup` raise it.
+        PlacewiseError: As `lock_home`, `migrate` and `open_store` raise it.
     """
     exclusive = settings.database_url is None
-    folder, manifest = open_backup(source)
     with contextlib.ExitStack() as stack:
         if exclusive:
             stack.enter_context(lock_home(settings.placewise_home))
-        if os.access(source, os.W_OK):  # a read-only folder has no concurrent writer
-            stack.enter_context(folder.exclusive_lock())
-        catalog = stack.enter_context(contextlib.closing(open_catalog(settings, "restore")))
+        opened = open_catalog(settings, command, NO_TIMEOUTS)
+        catalog = stack.enter_context(contextlib.closing(opened))
         migrate(catalog)
-        restored = restore_backup(
-            folder,
-            manifest,
-            catalog,
-            lambda: open_installation_store(catalog, settings, exclusive=exclusive),
-            progress,
-            store_owner=read_owner(open_store(settings, exclusive=False)),
-        )
-    return manifest, restored
+        yield catalog, open_store(settings, exclusive=exclusive)
+
+
+def restore(settings: Settings, source: Path, progress: BackupProgress) -> RestoreReport:
+    """Restore the backup in the folder `source` into an empty installation.
+
+    Raises:
+        PlacewiseError: As `open_backup`, `_open_new_catalog` and `restore_backup` raise it.
+    """
+    from services.cli.recovery.restore import open_backup, restore_backup
+
+    folder = BackupFolder(source)
+    open_backup(folder)  # before anything is created
+    with contextlib.ExitStack() as stack:
+        if os.access(source, os.W_OK):  # a read-only folder has no concurrent writer
+            stack.enter_context(folder.lock())
+        catalog, store = stack.enter_context(_open_new_catalog(settings, "restore"))
+        return restore_backup(folder, catalog, store, settings, progress)
 
 
 def rebuild(settings: Settings, progress: BackupProgress) -> RecoveryReport:
     """Rebuild a lost catalog from the object store.
 
     Raises:
-        PlacewiseError: As `lock_home`, `migrate` and `begin_rebuild` raise it.
+        PlacewiseError: As `_open_new_catalog` and `begin_rebuild` raise it.
     """
-    from shared.rebuild.recover import begin_rebuild, recover_catalog
+    from services.cli.recovery.rebuild import begin_rebuild, rebuild_catalog
 
-    exclusive = settings.database_url is None
-    with contextlib.ExitStack() as stack:
-        if exclusive:
-            stack.enter_context(lock_home(settings.placewise_home))
-        catalog = stack.enter_context(
-            contextlib.closing(open_catalog(settings, "rebuild", NO_TIMEOUTS))
-        )
-        migrate(catalog)
-        begin_rebuild(catalog, open_store(settings, exclusive=exclusive))
-        store = open_installation_store(catalog, settings, exclusive=exclusive)
-        return recover_catalog(catalog, store, settings, unnamed_age_seconds=0.0, progress=progress)
-
-
-@dataclass(frozen=True, slots=True)
-class Verification:
-    """Result of `verify`."""
-
-    report: IntegrityReport
-    lag: Lag | None
-    """How the catalog is behind the journal; None if it is up to date."""
-    recovered: RecoveryReport | None
-    """What a repair has recovered from the journal."""
-    queued_photos: int | None
-    """Photos that a repair has queued for description; None without a repair."""
+    with _open_new_catalog(settings, "rebuild") as (catalog, store):
+        mark = read_owner(store)
+        begin_rebuild(catalog, store, UUID(mark) if mark else None)
+        return rebuild_catalog(catalog, store, settings, with_unnamed=True, progress=progress)
 
 
 def verify_storage(
     settings: Settings, progress: BackupProgress, *, originals: bool, repair: bool
-) -> Verification:
+) -> tuple[IntegrityReport, int | None]:
     """Check the object store against the catalog; raises as `_open_storage` does.
 
     Args:
         settings: Settings that locate both.
         progress: Called with a stage, what is done, and the total.
         originals: Whether to check the hashes of the original photos, too.
-        repair: Whether to queue photos of damaged chunks and to recover missing records.
+        repair: Whether to queue the photos of damaged chunks.
+
+    Returns:
+        The report, and the number of photos that a repair has queued; None without a repair.
     """
     with _open_storage(settings, "verify") as (catalog, store):
-        lag, recovered = catalog_lag(catalog, store), None
-        if lag is not None and repair:
-            recovered = _recover_from_journal(catalog, store, settings, lag, progress)
         report = verify_store(catalog, store, originals=originals, progress=progress)
         for info in find_orphans(catalog, store, age_seconds=0.0):
             report.orphans += 1
@@ -180,23 +170,7 @@ def verify_storage(
         report.trash_objects, report.trash_bytes = trash.objects, trash.size_bytes
         # No wakeup message is needed: workers poll, and the steward sends messages.
         queued = repair_descriptors(catalog, InProcessWakeups(), report) if repair else None
-    return Verification(report, lag, recovered, queued)
-
-
-def _recover_from_journal(
-    catalog: Catalog, store: ObjectStore, settings: Settings, lag: Lag, progress: BackupProgress
-) -> RecoveryReport:
-    if lag.since is None:
-        raise Conflict("rebuild_unfinished", lag.detail)
-    from shared.rebuild.recover import recover_catalog  # decodes photos: not in every image
-
-    may_be_serving = settings.database_url is not None or find_running_server(
-        settings.placewise_home
-    )
-    age_seconds = UPLOAD_SECONDS if may_be_serving else 0.0
-    return recover_catalog(
-        catalog, store, settings, unnamed_age_seconds=age_seconds, progress=progress
-    )
+    return report, queued
 
 
 def adopt_storage(settings: Settings, *, confirm: bool) -> StoreCount:
@@ -218,7 +192,7 @@ def adopt_storage(settings: Settings, *, confirm: bool) -> StoreCount:
         is_new = catalog.is_sqlite and not Path(catalog.url.database or "").exists()
         if not is_new:
             check_schema(catalog)
-            _check_not_owned(catalog, read_owner(store))
+            _check_not_owned(catalog, store)
         count = count_store(None if is_new else catalog, store)
         unknown = count.orphans.total()
         if confirm:
@@ -230,11 +204,13 @@ def adopt_storage(settings: Settings, *, confirm: bool) -> StoreCount:
     return count
 
 
-def _check_not_owned(catalog: Catalog, owner: str | None) -> None:
+def _check_not_owned(catalog: Catalog, store: OwnedStore) -> None:
     with catalog.write() as session:
         installation_id = get_or_create_installation(session).id
-    if owner == str(installation_id):
-        raise Conflict("already_owner", "This catalog already owns the store.")
+    if read_owner(store) == str(installation_id):
+        with contextlib.suppress(Misconfigured):  # an older catalog may be made the owner
+            check_not_behind(catalog, store)
+            raise Conflict("already_owner", "This catalog already owns the store.")
 
 
 def collect_storage(settings: Settings, *, confirm: bool) -> tuple[StoreCount, int, Hold | None]:
@@ -247,8 +223,10 @@ def collect_storage(settings: Settings, *, confirm: bool) -> tuple[StoreCount, i
         count, moved, hold = StoreCount(), 0, read_hold(store)
         for _ in find_orphans(catalog, store, settings.orphan_age_seconds, count):
             pass
-        if confirm:
-            moved = collect_orphans(catalog, store, settings.orphan_age_seconds, confirmed=True)
+        while confirm and (
+            batch := collect_orphans(catalog, store, settings.orphan_age_seconds, confirmed=True)
+        ):
+            moved += batch
     return count, moved, hold
 
 

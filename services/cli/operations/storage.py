@@ -15,7 +15,6 @@ from rich.markup import escape
 from services.cli.environment import read_settings
 from services.cli.operations.backup import (
     backup,
-    print_taken_in,
     progress_reporter,
     rebuild_catalog,
     restore,
@@ -23,7 +22,6 @@ from services.cli.operations.backup import (
 from services.cli.output import (
     JsonOption,
     console,
-    err_console,
     print_json,
     print_message,
     print_note,
@@ -57,26 +55,19 @@ def verify(
 ) -> None:
     """Check every chunk against its hash and the catalog while services run.
 
-    The exit code is 1 if a fault is found, even if it is repaired. If the catalog is older than the
-    object store, --repair also recovers the missing records from the store's journal.
+    The exit code is 1 if a fault is found, even if it is repaired.
     """
     with progress_reporter() as progress:
         from services.cli.operations.maintenance import verify_storage
 
-        result = verify_storage(read_settings(), progress, originals=originals, repair=repair)
+        report, queued = verify_storage(
+            read_settings(), progress, originals=originals, repair=repair
+        )
     if as_json:
-        recovery = {
-            "lag": result.lag.detail if result.lag else None,
-            "taken_in": asdict(result.recovered) if result.recovered else None,
-        }
-        print_json(_report_as_json(result.report, result.queued_photos) | recovery)
+        print_json(_report_as_json(report, queued))
     else:
-        if result.recovered is not None:
-            print_taken_in(result.recovered)
-        elif result.lag is not None:
-            err_console.print(f"[red]behind[/red] {escape(result.lag.detail)}", soft_wrap=True)
-        _print_report(result.report, result.queued_photos)
-    if result.report.faults or result.lag is not None:
+        _print_report(report, queued)
+    if report.faults:
         raise typer.Exit(1)
 
 
@@ -185,11 +176,12 @@ def create_bucket_command(as_json: JsonOption = False) -> None:
 
 @app.command("adopt")
 def adopt(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
-    """Make this catalog the owner of the object store.
+    """Make this catalog the owner of the object store, also if the catalog is an older copy.
 
-    Use it if the catalog that owns the store is lost. Stop every service that uses the store first:
-    services with the previous catalog refuse to start afterwards. Objects that are not in this
-    catalog are kept until you run `placewise storage collect --confirm`.
+    Use it if the catalog that owns the store is lost and you do not want to rebuild it. Stop every
+    service that uses the store first: services with the previous catalog refuse to start
+    afterwards. Objects that are not in this catalog are kept until you run `placewise storage
+    collect --confirm`.
     """
     from services.cli.operations.maintenance import adopt_storage
 
@@ -250,8 +242,7 @@ def restore_trash(
     """Move objects from the trash back to their keys while services run.
 
     This does not add them to the catalog: they are orphans again and are kept for another
-    ORPHAN_AGE_SECONDS. `placewise verify --repair` recovers originals; `placewise storage rebuild`
-    rebuilds a catalog from all objects.
+    ORPHAN_AGE_SECONDS. `placewise storage rebuild` creates a catalog from all objects.
     """
     from services.cli.operations.maintenance import restore_from_trash
 

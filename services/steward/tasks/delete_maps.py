@@ -17,8 +17,11 @@ from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
 from services.steward.periodic_tasks import periodic_task
-from services.steward.tasks.garbage_collection import delete_with_objects
-from services.steward.tasks.journal import deletion_is_journaled, journal_deletions
+from services.steward.tasks.garbage_collection import (
+    delete_with_objects,
+    deletion_is_journaled,
+    journal_deletions,
+)
 from services.steward.tasks.maintenance import TRACKS_PER_TRANSACTION
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk, Descriptor, delete_chunk_rows

@@ -4,10 +4,14 @@ Each function handles up to ROWS_PER_TRANSACTION rows of one kind. It deletes th
 their rows afterwards: after a crash in between the deletion is repeated, which is harmless, while
 the opposite order would leave objects that no row refers to. Objects without rows are collected in
 `services.steward.tasks.orphans`.
+
+The journal has to record the deletion of a photo or a map before its objects are deleted, or a
+catalog rebuilt from it would restore the row.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Sequence
 from itertools import islice
 from typing import TypeVar
@@ -17,17 +21,18 @@ from sqlalchemy import Select, and_, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
 from services.steward.periodic_tasks import periodic_task
-from services.steward.tasks.journal import deletion_is_journaled, journal_deletions
 from services.steward.tasks.reindex_jobs import delete_done_reindex_jobs, settle_photo_jobs
 from shared.catalog.chunks import Chunk, Descriptor, delete_chunk_rows
-from shared.catalog.database.base import db_now, db_now_plus, is_journaled
+from shared.catalog.database.base import Condition, db_now, db_now_plus, is_journaled
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import QUERY_JOBS, QUERY_TTL_SECONDS, UNFINISHED_STATES, Job, JobKind
-from shared.catalog.maps import increment_map_version, lock_map
+from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.photos import Photo, PresignedUpload
 from shared.catalog.tracks import TrackFrame, is_pending
 from shared.catalog.vocabularies import StoredWhitening
+from shared.errors import Unavailable
+from shared.journal.outbox import write_journal
 from shared.storage import ObjectStore
 from shared.storage.chunks import delete_chunk
 from shared.storage.keys import (
@@ -39,12 +44,18 @@ from shared.storage.keys import (
     query_object_keys,
 )
 
+log = logging.getLogger(__name__)
+
 T = TypeVar("T")
 
 SUPERSEDED_GRACE_SECONDS = 600.0  # search reads a merged chunk until it has loaded the new one
 RETIRED_GRACE_SECONDS = 3600.0  # the same of a replaced generation, and time to switch back
 ROWS_PER_TRANSACTION = 500  # rows handled in one transaction
 COMPLETED_UPLOAD_SECONDS = 86_400.0  # retention of a completed presigned upload
+# A full object store accepts no journal segment, and only deletions free space. A photo that is
+# deleted before the journal records it does not come back either: without its original it is not
+# rebuilt.
+MAX_JOURNAL_WAIT_SECONDS = 60.0
 
 
 def delete_with_objects(
@@ -68,6 +79,24 @@ def delete_with_objects(
         with catalog.write() as session:
             delete_rows(session, found)
     return bool(found)
+
+
+def journal_deletions(catalog: Catalog, store: ObjectStore, table: type[Photo] | type[Map]) -> None:
+    """Write the journal if it lacks deletions of the table; log a warning if the store refuses."""
+    pending = select(table.id).where(table.deleted_at.is_not(None), ~is_journaled(table))
+    with catalog.read() as session:
+        if session.scalar(pending.limit(1)) is None:
+            return
+    try:
+        write_journal(catalog, store)
+    except Unavailable as error:
+        log.warning("deletions could not be written to the journal: %s", error)
+
+
+def deletion_is_journaled(table: type[Photo] | type[Map]) -> Condition:
+    """Condition for deleted rows whose objects may be deleted: the journal records the deletion, or
+    could not be written for MAX_JOURNAL_WAIT_SECONDS."""
+    return or_(is_journaled(table), table.deleted_at < db_now_plus(-MAX_JOURNAL_WAIT_SECONDS))
 
 
 def collect_superseded_chunks(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:

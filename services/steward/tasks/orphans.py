@@ -2,9 +2,9 @@
 
 Orphans are left by a crash between writing an object and committing its row. The walk lists every
 prefix of the store in batches and looks the keys of a batch up with one query
-(`REFERENCED_BY_PREFIX`). Orphans are first counted: where there are suspiciously many, or the
-catalog is older than its store, collection is held until an operator confirms it
-(`placewise storage collect --confirm`). Objects in the trash are deleted after TRASH_DAYS.
+(`REFERENCED_BY_PREFIX`). Orphans are first counted: where there are suspiciously many, collection
+is held until an operator confirms it (`placewise storage collect --confirm`). Objects in the trash
+are deleted after TRASH_DAYS.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.base import db_now
 from shared.catalog.database.session import Catalog
+from shared.catalog.installation import check_not_behind
 from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo, PresignedUpload
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.errors import Conflict
-from shared.journal.outbox import accept_segments, catalog_lag
 from shared.storage import ObjectStore, OwnedStore
 from shared.storage.chunks import codes_key, manifest_key
 from shared.storage.keys import (
@@ -65,7 +65,7 @@ from shared.storage.trash import (
 log = logging.getLogger(__name__)
 
 OBJECTS_PER_LOOKUP = 500  # keys looked up in one query
-MAX_REMEMBERED_ORPHANS = 10_000  # with more, the store is walked a second time to move the rest
+MAX_ORPHANS_PER_RUN = 100_000  # they are held in memory until all are counted
 MAX_ORPHAN_SHARE = 0.1  # of all objects; a larger one is held until it is confirmed
 HOLD_MIN_ORPHANS = 100  # so few are never held: in a small store they are a large share
 
@@ -96,35 +96,33 @@ def collect_orphans(
     *,
     confirmed: bool = False,
 ) -> int:
-    """Move objects that no catalog row refers to to the trash.
+    """Move objects that no catalog row refers to to the trash, up to MAX_ORPHANS_PER_RUN.
 
     Args:
         catalog: The catalog that refers to the objects.
         store: The catalog's object store.
         age_seconds: Younger objects stay, because their rows may not be committed yet.
-        confirmed: Move the orphans also where collection would be held. Also ends the lag of a
-            catalog that is older than its store: the objects that only newer catalogs knew are in
-            the trash then, and the journal continues.
+        confirmed: Move the orphans also where collection would be held.
 
     Returns:
         The number of objects moved.
 
     Raises:
-        CollectionHeld: Nothing was moved, because the catalog is older than its store, because it
-            adopted a store whose objects it does not know, or because the orphans exceed
-            MAX_ORPHAN_SHARE of all objects. A note in the store records the hold.
+        CollectionHeld: Nothing was moved, because the catalog adopted a store whose objects it does
+            not know, or because the orphans exceed MAX_ORPHAN_SHARE of all objects. A note in the
+            store records the hold.
+        Misconfigured: As `check_not_behind`; nothing was moved.
     """
-    count, first_orphans = StoreCount(), list[ObjectInfo]()
+    check_not_behind(catalog, store)
+    count, found = StoreCount(), list[ObjectInfo]()
     for info in find_orphans(catalog, store, age_seconds, count):
-        if len(first_orphans) < MAX_REMEMBERED_ORPHANS:
-            first_orphans.append(info)
+        if len(found) < MAX_ORPHANS_PER_RUN:
+            found.append(info)
     orphans, previous_hold = count.orphans.total(), read_hold(store)
     if orphans and not confirmed:
         reason = None
         if previous_hold is not None and previous_hold.reason == HoldReason.ADOPTED:
             reason = HoldReason.ADOPTED
-        elif catalog_lag(catalog, store) is not None:
-            reason = HoldReason.CATALOG_BEHIND
         elif orphans > max(HOLD_MIN_ORPHANS, MAX_ORPHAN_SHARE * count.objects):
             reason = HoldReason.SHARE
         if reason is not None:
@@ -132,11 +130,11 @@ def collect_orphans(
             if hold != previous_hold:
                 write_hold(store, hold)
             raise CollectionHeld(hold)
-    moved = _move_orphans(catalog, store, first_orphans)
-    if orphans > len(first_orphans):
-        moved += _move_orphans(catalog, store, find_orphans(catalog, store, age_seconds))
-    if confirmed:
-        accept_segments(catalog, store)
+    moved, today = 0, _now(catalog).date()
+    for prefix, same_prefix in groupby(found, lambda info: info.key.partition("/")[0] + "/"):
+        for batch in _batches(same_prefix):
+            for info in _select_orphans(catalog, prefix, batch):  # still
+                moved += move_to_trash(store, info.key, today)
     if previous_hold is not None and (confirmed or previous_hold.reason != HoldReason.ADOPTED):
         end_hold(store)
     if moved:
@@ -199,16 +197,6 @@ def _select_orphans(catalog: Catalog, prefix: str, batch: list[ObjectInfo]) -> l
     with catalog.read() as session:
         referenced = set(REFERENCED_BY_PREFIX[prefix](session, [info.key for info in batch]))
     return [info for info in batch if info.key not in referenced]
-
-
-def _move_orphans(catalog: Catalog, store: OwnedStore, orphans: Iterable[ObjectInfo]) -> int:
-    """Move the objects that are still orphans to today's trash; return how many were moved."""
-    today, moved = _now(catalog).date(), 0
-    for prefix, same_prefix in groupby(orphans, lambda info: info.key.partition("/")[0] + "/"):
-        for batch in _batches(same_prefix):
-            for info in _select_orphans(catalog, prefix, batch):
-                moved += move_to_trash(store, info.key, today)
-    return moved
 
 
 def empty_expired_trash(

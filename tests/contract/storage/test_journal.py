@@ -11,21 +11,23 @@ from typing import Any
 from uuid import UUID
 
 import pytest
-from sqlalchemy import delete, select, update
 
+from services.cli.recovery.journal_rows import LatestStates
+from shared.catalog.api_keys import create_api_key, record_key_use, revoke_api_key
 from shared.catalog.database.session import Catalog
-from shared.catalog.installation import Installation
-from shared.catalog.maps import Map
+from shared.catalog.installation import check_not_behind
+from shared.catalog.jobs import JobKind, JobState
 from shared.catalog.photos import Photo
-from shared.errors import Unavailable
+from shared.catalog.webhooks import EventKind, create_webhook, delete_webhook
+from shared.errors import Misconfigured, Unavailable
 from shared.ids import new_id
-from shared.journal import outbox, segments
-from shared.journal.outbox import catalog_lag, write_journal
-from shared.journal.segments import Line, last_states, list_segments, read_segment
-from shared.rebuild.rows import LatestStates
+from shared.journal.outbox import write_journal, write_snapshot
+from shared.journal.segments import TABLES, Line, last_states, read_lines
+from shared.security.api_keys import Scope
 from shared.storage import FolderStore, ObjectStore
 from shared.storage.s3 import S3Store
-from tests.support.catalog_rows import add_map, add_photo
+from shared.storage.segments import list_segments
+from tests.support.catalog_rows import add_job, add_map, add_photo
 from tests.support.catalog_rows import delete as delete_photo
 from tests.support.servers import S3Server
 
@@ -49,14 +51,10 @@ def newer(migrated_sqlite: Path, tmp_path: Path) -> Iterator[Catalog]:
 
 
 def journaled(store: ObjectStore) -> dict[UUID, Line]:
-    """The last state of each row that the store's journal holds."""
-    lines = [line for one in list_segments(store) for line in read_segment(store, one.key).lines]
-    return {line.id: line for line in last_states(lines)}
-
-
-def sequence(catalog: Catalog) -> int:
-    with catalog.read() as session:
-        return session.scalar(select(Installation.journal_sequence)) or 0
+    """The last state of each row that the store's segments hold."""
+    segments = [one for one in list_segments(store) if not one.is_snapshot]
+    lines = [line for one in segments for line in read_lines(store, one.key)]
+    return {line.id: line for line in last_states(lines) if line.id is not None}
 
 
 def filled(catalog: Catalog) -> tuple[UUID, UUID]:
@@ -73,7 +71,7 @@ def test_every_change_of_a_photo_and_a_map_is_in_the_journal(
     catalog: Catalog, store: ObjectStore
 ) -> None:
     map_id, photo_id = filled(catalog)
-    assert write_journal(catalog, store).lines == 2
+    assert write_journal(catalog, store) == 2
     row = journaled(store)[photo_id].row
     assert (row["tags"], row["place"], row["latitude"]) == (
         ["night", "rain"],
@@ -81,153 +79,167 @@ def test_every_change_of_a_photo_and_a_map_is_in_the_journal(
         45.123456789,
     )
     assert row["deleted_at"] is None
-    assert write_journal(catalog, store).lines == 0, "nothing has changed"
+    assert write_journal(catalog, store) == 0, "nothing has changed"
 
     with catalog.write() as session:  # through the ORM, as a PATCH does
         session.get_one(Photo, photo_id).place = "hall"
-    assert write_journal(catalog, store).lines == 1
+    assert write_journal(catalog, store) == 1
     assert journaled(store)[photo_id].row["place"] == "hall"
 
     delete_photo(catalog, map_id, photo_id)  # by an UPDATE
     write_journal(catalog, store)
     assert journaled(store)[photo_id].row["deleted_at"] is not None
-    assert sequence(catalog) == len(list_segments(store)) == 3
-    assert catalog_lag(catalog, store) is None
+    assert [segment.last for segment in list_segments(store)] == [1, 2, 3]
+    check_not_behind(catalog, store)
 
 
-def test_rows_of_before_the_journal_are_pending(catalog: Catalog, store: ObjectStore) -> None:
-    _, photo_id = filled(catalog)
-    with catalog.write() as session:  # as the migration leaves them
-        session.execute(update(Photo).values(revision=1, journaled_revision=0))
-    write_journal(catalog, store)
-    assert photo_id in journaled(store)
+def test_keys_and_webhooks_are_in_the_journal_and_so_is_their_end(
+    catalog: Catalog, store: ObjectStore
+) -> None:
+    with catalog.write() as session:
+        key, _ = create_api_key(session, "theirs", {Scope.READ})
+        webhook = create_webhook(session, "https://example.com/hook", [EventKind.JOB_FAILED])
+    assert write_journal(catalog, store) == 2
+    with catalog.write() as session:
+        record_key_use(session, key.id)
+    assert write_journal(catalog, store) == 0, "its use is no change"
+    with catalog.write() as session:
+        revoke_api_key(session, key.id)
+        delete_webhook(session, webhook.id)
+    assert write_journal(catalog, store) == 2
+    rows = {id_: line.row for id_, line in journaled(store).items()}
+    assert rows[key.id]["revoked_at"] is not None
+    assert rows[webhook.id]["deleted_at"] is not None
+    assert rows[webhook.id]["secret"] == ""
 
 
-def test_a_writer_that_dies_before_its_commit_is_no_lag_and_nothing_is_lost(
+class DyingStore:
+    """Dies at the end of a write, after what it was to write was written."""
+
+    def __init__(self, store: ObjectStore) -> None:
+        self._store = store
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._store, name)
+
+    def writer(self, key: str) -> Any:
+        raise KeyboardInterrupt
+
+
+def test_a_writer_that_dies_before_or_after_its_segment_is_written_loses_nothing(
     catalog: Catalog, store: ObjectStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, photo_id = filled(catalog)
+    dying: Any = DyingStore(store)
+    with pytest.raises(KeyboardInterrupt):
+        write_journal(catalog, dying)
+    assert list_segments(store) == []
+    check_not_behind(catalog, store)
 
-    def die(*_: Any, **__: Any) -> bool:
+    def die(*_: Any) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(outbox, "_commit", die)
+        patched.setattr(catalog, "run", die)  # the marks are not cleared
         with pytest.raises(KeyboardInterrupt):
             write_journal(catalog, store)
-    assert len(list_segments(store)) == 1
-    assert sequence(catalog) == 0
-    assert catalog_lag(catalog, store) is None
+    check_not_behind(catalog, store)
     with catalog.write() as session:
         session.get_one(Photo, photo_id).place = "later"
-    assert catalog_lag(catalog, store) is None, "its rows are known, in a newer state"
-    assert write_journal(catalog, store).lines == 2
-    assert sequence(catalog) == 2, "the number of the segment that was left is not used again"
+    assert write_journal(catalog, store) == 2
+    assert [segment.last for segment in list_segments(store)] == [2, 3]
     assert journaled(store)[photo_id].row["place"] == "later"
+    assert write_journal(catalog, store) == 0
 
 
-def test_what_changes_while_it_is_written_is_written_again(
-    catalog: Catalog, store: ObjectStore, monkeypatch: pytest.MonkeyPatch
+class InterruptedStore:
+    """Calls `meanwhile` once, before a segment is written whose lines were read already."""
+
+    def __init__(self, store: ObjectStore, meanwhile: Callable[[], object]) -> None:
+        self._store, self._meanwhile = store, [meanwhile]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._store, name)
+
+    def writer(self, key: str) -> Any:
+        while self._meanwhile:
+            self._meanwhile.pop()()
+        return self._store.writer(key)
+
+
+@pytest.mark.parametrize("by_another_steward", [False, True])
+def test_what_changes_while_a_segment_is_written_is_written_by_the_next_one(
+    catalog: Catalog, store: ObjectStore, by_another_steward: bool
 ) -> None:
     _, photo_id = filled(catalog)
-    real = segments.put_segment
 
-    def change_meanwhile(*arguments: Any) -> str:
-        monkeypatch.setattr(outbox, "put_segment", real)
-        with catalog.write() as session:
-            session.get_one(Photo, photo_id).place = "meanwhile"
-        return real(*arguments)
-
-    monkeypatch.setattr(outbox, "put_segment", change_meanwhile)
-    write_journal(catalog, store)
-    assert journaled(store)[photo_id].row["place"] == "Żółw 🐢"
-    assert write_journal(catalog, store).lines == 1
-    assert journaled(store)[photo_id].row["place"] == "meanwhile"
-
-
-def test_two_stewards_at_once_lose_no_state(
-    catalog: Catalog, store: ObjectStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The slower one has read an older state of the photo, and writes it last."""
-    _, photo_id = filled(catalog)
-    real = segments.put_segment
-
-    def overtaken(*arguments: Any) -> str:
-        monkeypatch.setattr(outbox, "put_segment", real)
+    def change() -> None:
         with catalog.write() as session:
             session.get_one(Photo, photo_id).place = "newer"
-        assert write_journal(catalog, store).lines == 2
-        return real(*arguments)
+        if by_another_steward:
+            assert write_journal(catalog, store) == 2
 
-    monkeypatch.setattr(outbox, "put_segment", overtaken)
-    assert write_journal(catalog, store).lines == 0
+    interrupted: Any = InterruptedStore(store, change)
+    assert write_journal(catalog, interrupted) == 2
+    assert write_journal(catalog, store) == (0 if by_another_steward else 1)
     assert journaled(store)[photo_id].row["place"] == "newer"
-    assert len(list_segments(store)) == sequence(catalog) == 1
-    assert write_journal(catalog, store).lines == 0
 
 
 def test_many_segments_become_one_with_the_last_states(
-    catalog: Catalog, store: ObjectStore, monkeypatch: pytest.MonkeyPatch
+    catalog: Catalog, store: ObjectStore
 ) -> None:
-    for module in (outbox, segments):
-        monkeypatch.setattr(module, "MIN_SEGMENTS_TO_MERGE", 4)
     _, photo_id = filled(catalog)
+    write_snapshot(catalog, store)  # is not merged
     for number in range(9):
         with catalog.write() as session:
             session.get_one(Photo, photo_id).place = f"place {number}"
-        write_journal(catalog, store)
-        assert len(list_segments(store)) < 4
-    merged = list_segments(store)[0]
-    assert (merged.first, merged.last) == (1, 7)
+        write_journal(catalog, store, min_segments_to_merge=4)
+        assert len(list_segments(store)) <= 6
+    snapshot, merged, *_ = list_segments(store)
+    assert snapshot.is_snapshot
+    assert (merged.first, merged.last) == (2, 8)
     assert journaled(store)[photo_id].row["place"] == "place 8"
     assert len(journaled(store)) == 2
-    assert catalog_lag(catalog, store) is None
+    check_not_behind(catalog, store)
 
 
-def test_an_older_catalog_is_behind_and_writes_nothing(
+def test_a_snapshot_has_what_the_journal_lacks_and_replaces_the_one_before(
+    catalog: Catalog, store: ObjectStore
+) -> None:
+    map_id, photo_id = filled(catalog)
+    write_journal(catalog, store)
+    with catalog.write() as session:
+        session.get_one(Photo, photo_id).place = "pending"
+        jobs = {
+            state: add_job(session, map_id, photo_id=photo_id, state=state).id
+            for state in (JobState.QUEUED, JobState.FAILED, JobState.SUCCEEDED)
+        }
+        add_job(session, map_id, JobKind.DESCRIBE)
+        evaluation = add_job(session, map_id, JobKind.EVALUATE, state=JobState.SUCCEEDED).id
+    for _ in range(2):
+        write_snapshot(catalog, store)
+    segment, snapshot = list_segments(store)
+    assert (segment.is_snapshot, snapshot.is_snapshot) == (False, True)
+    lines = list(read_lines(store, snapshot.key))
+    assert [line.id for line in lines if line.table in TABLES] == [photo_id]
+    expected = {jobs[JobState.QUEUED], jobs[JobState.FAILED], evaluation}
+    assert {UUID(line.row["id"]) for line in lines if line.table == "jobs"} == expected
+
+
+def test_a_catalog_that_is_older_than_its_store_writes_nothing_and_no_process_starts_with_it(
     catalog: Catalog, newer: Catalog, store: ObjectStore
 ) -> None:
     filled(newer)
     write_journal(newer, store)
-    assert catalog_lag(newer, store) is None
-    _, photo_id = filled(catalog)
-    lag = catalog_lag(catalog, store)
-    assert lag is not None
-    assert (lag.segments, lag.since) == (1, list_segments(store)[0].modified_at)
-    assert "verify --repair" in lag.detail
-    written = write_journal(catalog, store)
-    assert (written.lines, written.lag) == (0, lag)
+    check_not_behind(newer, store)
+    filled(catalog)
+    for refused in (check_not_behind, write_journal, write_snapshot):
+        with pytest.raises(Misconfigured) as caught:
+            refused(catalog, store)  # type: ignore[operator]
+        assert caught.value.code == "catalog_behind"
+        assert f"{list_segments(store)[0].modified_at:%H:%M:%S} UTC" in caught.value.detail
+        assert "storage rebuild" in caught.value.detail
     assert len(list_segments(store)) == 1
-    assert photo_id not in journaled(store)
-
-
-BACK: dict[str, Callable[[UUID], Any]] = {
-    "photo not there yet": lambda id_: delete(Photo).where(Photo.id == id_),
-    "older state": lambda id_: (
-        update(Photo).where(Photo.id == id_).values(revision=1, journaled_revision=1)
-    ),
-    "another state of the same revision": lambda id_: (
-        update(Photo).where(Photo.id == id_).values(place="never written", revision=Photo.revision)
-    ),
-    "map not there yet": lambda id_: update(Map).values(revision=0, journaled_revision=0),
-}
-
-
-@pytest.mark.parametrize("store", ["folder"], indirect=True)
-@pytest.mark.parametrize("back", BACK.values(), ids=BACK.keys())
-def test_a_restored_state_of_before_is_behind(
-    catalog: Catalog, store: ObjectStore, back: Callable[[UUID], Any]
-) -> None:
-    _, photo_id = filled(catalog)
-    with catalog.write() as session:
-        session.get_one(Photo, photo_id).place = "second state"
-    write_journal(catalog, store)
-    with catalog.write() as session:
-        session.execute(update(Installation).values(journal_sequence=0))
-    assert catalog_lag(catalog, store) is None
-    with catalog.write() as session:
-        session.execute(back(photo_id))
-    assert catalog_lag(catalog, store) is not None
 
 
 MALFORMED: dict[str, Any] = {
@@ -270,7 +282,7 @@ def test_a_malformed_line_is_named_and_its_segment_is_left_out_of_a_rebuild(
     lines[number] = malformed
     store.put(segment.key, gzip.compress(b"\n".join([head, *lines])))
     with pytest.raises(Unavailable) as caught:
-        read_segment(store, segment.key)
+        list(read_lines(store, segment.key))
     assert caught.value.code == "journal_damaged"
     assert f"{segment.key} can't be read (line {number + 2}: " in caught.value.detail
     with LatestStates() as states:
@@ -281,7 +293,7 @@ def test_a_malformed_line_is_named_and_its_segment_is_left_out_of_a_rebuild(
 
 @pytest.mark.parametrize("store", ["folder"], indirect=True)
 def test_a_damaged_segment_says_which_and_stays_when_others_are_merged(
-    catalog: Catalog, store: ObjectStore, monkeypatch: pytest.MonkeyPatch
+    catalog: Catalog, store: ObjectStore
 ) -> None:
     filled(catalog)
     write_journal(catalog, store)
@@ -290,13 +302,11 @@ def test_a_damaged_segment_says_which_and_stays_when_others_are_merged(
     for damaged in (data[:-9], b"", data[:40] + b"xx" + data[42:], b"no gzip"):
         store.put(segment.key, damaged)
         with pytest.raises(Unavailable) as caught:
-            read_segment(store, segment.key)
+            list(read_lines(store, segment.key))
         assert caught.value.code == "journal_damaged"
         assert segment.key in caught.value.detail
-    for module in (outbox, segments):
-        monkeypatch.setattr(module, "MIN_SEGMENTS_TO_MERGE", 3)
-    for _ in range(2):
+    for _ in range(3):
         with catalog.write() as session:
             add_map(session, str(new_id()))
-        write_journal(catalog, store)
-    assert [(s.first, s.last) for s in list_segments(store)] == [(1, 1), (2, 3)]
+        write_journal(catalog, store, min_segments_to_merge=3)
+    assert [(s.first, s.last) for s in list_segments(store)] == [(1, 1), (2, 3), (4, 4)]

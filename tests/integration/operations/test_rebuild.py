@@ -1,51 +1,55 @@
-"""A lost catalog is rebuilt from its store, and an older one takes in what it lacks."""
+"""A lost catalog is rebuilt from its store."""
 
 from __future__ import annotations
 
-import contextlib
 import json
+import threading
+from functools import partial
 from typing import Any
 from uuid import UUID, uuid4
 
 import numpy as np
 import pytest
-from sqlalchemy import delete, func, insert, select
+from sqlalchemy import delete, func, select
 
-from services.steward.tasks import journal
+from services.cli.recovery.rebuild import RecoveryReport, begin_rebuild, rebuild_catalog
+from services.steward.tasks import garbage_collection
 from services.steward.tasks.compaction import merge_small_chunks
 from services.steward.tasks.delete_maps import purge_deleted_maps
 from services.steward.tasks.garbage_collection import collect_deleted_photos
 from services.steward.tasks.model_changes import advance_model_changes
-from services.steward.tasks.orphans import CollectionHeld, collect_orphans
+from services.steward.tasks.orphans import collect_orphans
+from shared.catalog.api_keys import authenticate_api_key, create_api_key
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.base import Base
 from shared.catalog.database.session import Catalog
-from shared.catalog.generations import Generation
-from shared.catalog.installation import Installation, get_or_create_installation
-from shared.catalog.jobs import Job
+from shared.catalog.generations import Evaluation, Generation, GenerationState
+from shared.catalog.installation import (
+    Installation,
+    adopt_store,
+    check_not_behind,
+    get_or_create_installation,
+)
+from shared.catalog.jobs import Job, JobKind
 from shared.catalog.maps import Map, get_or_create_default_map
 from shared.catalog.photos import Photo
 from shared.config.settings import Settings
-from shared.errors import Conflict, StorageFull
-from shared.ids import new_id
+from shared.errors import Conflict, Misconfigured, StorageFull
 from shared.integrity.verify import verify_store
 from shared.jobs import InProcessWakeups
-from shared.journal.outbox import catalog_lag, write_journal
-from shared.journal.segments import list_segments
-from shared.rebuild import recover
-from shared.rebuild.recover import RecoveryReport, begin_rebuild, recover_catalog
+from shared.journal.outbox import write_journal, write_snapshot
+from shared.security.api_keys import Scope, hash_api_key
 from shared.storage import FolderStore
-from shared.storage.chunks import manifest_key, write_chunk
+from shared.storage.chunks import manifest_key
 from shared.storage.keys import JOURNAL, ORIGINALS
+from shared.storage.ownership import read_owner
+from shared.storage.segments import list_segments
 from tests.integration.in_process_api import Service
-from tests.support.catalog_rows import stored_rows
+from tests.support.catalog_rows import add_job, stored_rows
 from tests.support.photos import photo_bytes
 
 # tests/faults/test_rebuild_catalog.py does the same on SQLite.
 pytestmark = pytest.mark.databases("postgresql")
-
-VLAD = "test-tiny-vlad"
-POOLED = "test-tiny-vlad:aggregator=gem"
 
 SAID: dict[str, Any] = {
     "latitude": 45.5,
@@ -65,16 +69,20 @@ def lose_catalog(catalog: Catalog) -> None:
             session.execute(delete(table))
 
 
+def rebuild(service: Service) -> RecoveryReport:
+    owner = read_owner(service.store)
+    begin_rebuild(service.catalog, service.store, UUID(owner) if owner else None)
+    return rebuild_catalog(service.catalog, service.store, service.settings, with_unnamed=True)
+
+
 def rebuilt(service: Service) -> tuple[Service, RecoveryReport]:
     """Services on the rebuilt catalog."""
-    begin_rebuild(service.catalog, service.store)
-    taken = recover_catalog(service.catalog, service.store, service.settings, unnamed_age_seconds=0)
+    taken = rebuild(service)
     return Service(service.catalog, service.store, service.settings, service.make_worker), taken
 
 
 def photo(service: Service, file_id: str, map_name: str = "default") -> Any:
-    """What the API says of the photo, but for its job, which a rebuilt catalog does not know."""
-    return service.json("GET", f"/uploads/{file_id}", params={"map": map_name}) | {"job_id": None}
+    return service.json("GET", f"/uploads/{file_id}", params={"map": map_name})
 
 
 def answers(service: Service, file_id: str, map_name: str = "default") -> Any:
@@ -113,6 +121,7 @@ def test_every_photo_is_searchable_again_with_its_metadata(
     write_journal(service.catalog, store)
     with service.catalog.write() as session:
         installation_id = get_or_create_installation(session).id
+    adopt_store(service.catalog, store)
     fields = {file_id: photo(service, file_id, name) for file_id, name in left.items()}
     before = {file_id: answers(service, file_id, name) for file_id, name in left.items()}
     assert all(before.values())
@@ -130,12 +139,12 @@ def test_every_photo_is_searchable_again_with_its_metadata(
         assert session.scalars(select(Installation.id)).one() == installation_id
         assert session.scalar(select(func.count()).select_from(Photo)) == 6
     assert verify_store(service.catalog, store, originals=True).faults == []
-    assert catalog_lag(service.catalog, store) is None
+    check_not_behind(service.catalog, store)
     assert [m["name"] for m in service.json("GET", "/maps")] == ["default", "halls"]
     # It goes on: new photos come into the same generations, and the journal too.
     (new,) = service.indexed(7, map_name="halls")
     assert answers(service, new, "halls")
-    assert write_journal(service.catalog, store).lines > 0
+    assert write_journal(service.catalog, store) > 0
     assert collect_orphans(service.catalog, store, -1.0) > 0  # the deleted photo's and map's
     assert verify_store(service.catalog, store, originals=True).faults == []
 
@@ -155,39 +164,143 @@ def test_a_map_with_float16_rows_goes_on_with_them(service: Service, store: Fold
     assert [row.dtype for row in rows.values()] == 4 * [np.dtype(np.float16)]
 
 
+class DyingStore:
+    """Dies at a listing of the prefix."""
+
+    def __init__(self, store: FolderStore, prefix: str) -> None:
+        self._store, self._prefix = store, prefix
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._store, name)
+
+    def list(self, prefix: str) -> Any:
+        if prefix == self._prefix:
+            raise KeyboardInterrupt
+        return self._store.list(prefix)
+
+
 def test_a_rebuild_that_was_killed_goes_on_and_a_full_catalog_is_refused(
-    service: Service,
-    store: FolderStore,
-    settings: Settings,
-    monkeypatch: pytest.MonkeyPatch,
+    service: Service, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service.indexed(1, 2, 3, **SAID)
     write_journal(service.catalog, store)
-
+    service.upload(photo_bytes(4))
     lose_catalog(service.catalog)
 
-    def die(*_: Any, **__: Any) -> Any:
+    def die(*_: Any) -> Any:
         raise KeyboardInterrupt
 
-    for step in ("recover_chunks", "recover_originals", "_queue_photos"):
+    begin_rebuild(service.catalog, store, None)
+    for dying in (DyingStore(store, "chunks/"), store):
         with monkeypatch.context() as patched:
-            patched.setattr(recover, step, die)
+            patched.setattr("services.cli.recovery.rebuild._queue_photos", die)
             with pytest.raises(KeyboardInterrupt):
-                rebuilt(service)
-        lag = catalog_lag(service.catalog, store)
-        assert lag is not None
-        assert "storage rebuild" in lag.detail
-        with contextlib.suppress(CollectionHeld):
-            assert collect_orphans(service.catalog, store, -1.0) == 0
-        assert write_journal(service.catalog, store).lines == 0
-    rebuilt(service)
+                rebuild_catalog(
+                    service.catalog,
+                    dying,  # type: ignore[arg-type]
+                    service.settings,
+                    with_unnamed=True,
+                )
+        for refused in (check_not_behind, write_snapshot, partial(collect_orphans, age_seconds=-1)):
+            with pytest.raises(Misconfigured) as unfinished:
+                refused(service.catalog, store)  # type: ignore[operator]
+            assert unfinished.value.code == "rebuild_unfinished"
+    assert rebuild(service).photos == 3
     with service.catalog.read() as session:
-        for table, rows in ((Photo, 3), (Descriptor, 3), (Chunk, 1), (Job, 0)):
+        for table, rows in ((Photo, 4), (Descriptor, 3), (Chunk, 1), (Job, 1)):
             assert session.scalar(select(func.count()).select_from(table)) == rows, table
     assert verify_store(service.catalog, store, originals=True).faults == []
     with pytest.raises(Conflict, match="photos") as caught:
-        begin_rebuild(service.catalog, store)
+        rebuild(service)
     assert caught.value.code == "catalog_not_empty"
+
+
+def test_photos_that_are_not_described_yet_keep_their_jobs_and_failed_ones_are_tried_again(
+    service: Service, store: FolderStore
+) -> None:
+    waiting, failed = (service.upload(photo_bytes(number)) for number in (1, 2))
+    write_journal(service.catalog, store)
+    lose_catalog(service.catalog)
+    service, report = rebuilt(service)
+    assert report.queued_photos == 2
+    for sent in (waiting, failed):
+        assert service.json("GET", f"/jobs/{sent['job_id']}")["state"] == "queued"
+
+
+def test_history_of_the_last_snapshot_and_reports_and_keys_come_back_but_no_work_in_progress(
+    service: Service, store: FolderStore
+) -> None:
+    (file_id,) = service.indexed(1)
+    service.json("POST", f"/similarity/{file_id}")
+    service.json("POST", "/tracks", 201, json={})
+    with service.catalog.write() as session:
+        _, key = create_api_key(session, "theirs", {Scope.READ})
+        generation = session.scalars(select(Generation)).one()
+        session.add(
+            Evaluation(
+                map_id=generation.map_id,
+                generation_id=generation.id,
+                searchable=1,
+                labelled_queries=0,
+                figures={"recall": 1.0},
+            )
+        )
+        add_job(session, generation.map_id, JobKind.EVALUATE)
+    read = ("/searches", "/tracks", "/evaluations")
+    before = [service.json("GET", path) for path in read]
+    write_snapshot(service.catalog, store)
+    service.json("PATCH", f"/uploads/{file_id}", json={"place": "later"})
+    write_journal(service.catalog, store)
+    lose_catalog(service.catalog)
+    service, _ = rebuilt(service)
+    assert [service.json("GET", path) for path in read] == before
+    assert photo(service, file_id)["place"] == "later"
+    with service.catalog.read() as session:
+        assert authenticate_api_key(session, hash_api_key(key)).name == "theirs"
+        assert session.scalars(select(Job)).all() == []
+
+
+def test_a_model_change_of_a_snapshot_that_nothing_follows_is_finished(
+    service: Service, store: FolderStore
+) -> None:
+    left = two_maps(service)
+    halls = {"params": {"map": "halls"}, "json": {"clusters": 4, "seed": 1}}
+    job_id = service.json("POST", "/vocabularies", 202, **halls)["job_id"]
+    service.worker.fits.run_next(threading.Event())
+    advance_model_changes(service.catalog, InProcessWakeups())  # queues the photos
+    service.worker.drain(threading.Event())
+    write_journal(service.catalog, store)
+    write_snapshot(service.catalog, store)
+    building = select(Generation.id).where(Generation.state == GenerationState.BUILDING)
+    with service.catalog.read() as session:
+        generation_id = session.scalars(building).one()
+    lose_catalog(service.catalog)
+    service, report = rebuilt(service)
+    assert report.descriptors == 6 + 3
+    for _ in range(5):
+        service.drain()
+        service.search.sync()
+        advance_model_changes(service.catalog, InProcessWakeups())
+    assert service.json("GET", f"/jobs/{job_id}", params={"map": "halls"})["state"] == "succeeded"
+    with service.catalog.read() as session:
+        assert session.get_one(Generation, generation_id).state == GenerationState.ACTIVE
+    in_halls = [file_id for file_id, name in left.items() if name == "halls"]
+    assert len(answers(service, in_halls[0], "halls")) == 2
+    assert verify_store(service.catalog, store, originals=False).faults == []
+
+
+def test_photos_that_were_described_after_the_last_snapshot_are_not_described_again(
+    service: Service, store: FolderStore
+) -> None:
+    service.indexed(1)
+    sent = service.upload(photo_bytes(2))
+    write_journal(service.catalog, store)
+    write_snapshot(service.catalog, store)
+    service.drain()
+    lose_catalog(service.catalog)
+    service, report = rebuilt(service)
+    assert (report.descriptors, report.queued_photos) == (2, 0)
+    assert service.json("GET", f"/jobs/{sent['job_id']}")["state"] == "succeeded"
 
 
 @pytest.mark.parametrize("lost", ["chunk", "changed chunk", "manifest"])
@@ -273,26 +386,6 @@ def test_a_home_of_before_the_journal_comes_back_with_what_exif_says(
     assert len(answers(service, first)) == 1
 
 
-@pytest.mark.parametrize(("pools", "recovered"), [(True, VLAD), (False, POOLED)])
-def test_a_map_that_began_pooled_comes_back_with_the_extractor_that_waits_for_a_vocabulary(
-    catalog: Catalog, store: FolderStore, settings: Settings, pools: bool, recovered: str
-) -> None:
-    started = settings.model_copy(update={"extractor": VLAD, "pool_without_vocabulary": pools})
-    store.put(f"{ORIGINALS}{uuid4()}", photo_bytes(1))
-    chunk_id = new_id()
-    write_chunk(
-        store,
-        generation_id=new_id(),
-        chunk_id=chunk_id,
-        rows=np.eye(1, 4, dtype=np.float32),
-        photo_ids=[new_id()],
-        spec={"extractor": POOLED},
-    )
-    recover_catalog(catalog, store, started, unnamed_age_seconds=0)
-    with catalog.read() as session:
-        assert session.scalars(select(Map.extractor)).one() == recovered
-
-
 def test_a_photo_whose_original_is_gone_stays_away(
     service: Service, store: FolderStore, settings: Settings
 ) -> None:
@@ -305,65 +398,26 @@ def test_a_photo_whose_original_is_gone_stays_away(
     assert (taken.photos, taken.lost_originals, taken.descriptors) == (1, 1, 1)
 
 
-# --- an older catalog ------------------------------------------------------------------------
-
-
-def put_back(catalog: Catalog, rows: dict[str, list[dict[str, Any]]]) -> None:
-    """The rows of before, as if their database had been copied and put back."""
-    with catalog.write() as session:
-        for table in reversed(Base.metadata.sorted_tables):
-            session.execute(delete(table))
-        for table in Base.metadata.sorted_tables:
-            if rows[table.name]:
-                session.connection().execute(insert(table), rows[table.name])
-
-
-def copied(catalog: Catalog) -> dict[str, list[dict[str, Any]]]:
-    with catalog.read() as session:
-        return {
-            table.name: [dict(row) for row in session.execute(select(table)).mappings()]
-            for table in Base.metadata.sorted_tables
-        }
-
-
-def test_an_older_catalog_collects_nothing_and_takes_in_what_came_later(
-    service: Service, store: FolderStore, settings: Settings
+@pytest.mark.databases("sqlite")
+def test_photos_whose_map_is_in_a_damaged_segment_come_into_the_default_map(
+    service: Service, store: FolderStore
 ) -> None:
-    first, second = service.indexed(1, 2, **SAID)
+    service.json("POST", "/maps", 201, json={"name": "halls"})
+    (file_id,) = service.indexed(1, map_name="halls")
     write_journal(service.catalog, store)
-    older = copied(service.catalog)
-    (later,) = service.indexed(3, **SAID)
-    service.json("PATCH", f"/uploads/{first}", json={"place": "bridge"})
-    service.json("DELETE", f"/uploads/{second}")
-    service.json("POST", "/maps", 201, json={"name": "later"})
-    (elsewhere,) = service.indexed(4, map_name="later")
+    (damaged,) = (segment.key for segment in list_segments(store))
+    with service.catalog.write() as session:
+        session.get_one(Photo, UUID(file_id)).place = "later"
     write_journal(service.catalog, store)
-    fields = {later: photo(service, later), first: photo(service, first)}
-    before = {info.key for info in store.list("")}
-
-    put_back(service.catalog, older)
-    with pytest.raises(CollectionHeld):
-        collect_orphans(service.catalog, store, -1.0)
-    assert {info.key for info in store.list("")} == before
-    lag = catalog_lag(service.catalog, store)
-    assert lag is not None
-    assert lag.segments >= 1
-    assert write_journal(service.catalog, store).lines == 0
-
-    taken = recover_catalog(service.catalog, store, settings, unnamed_age_seconds=3600)
-    assert (taken.maps, taken.photos, taken.deleted_photos) == (1, 2, 1)
-    assert taken.changed_photos == 1
-    assert catalog_lag(service.catalog, store) is None
-    service.drain()
-    assert {id_: photo(service, id_) for id_ in fields} == fields
-    assert [one["image_id"] for one in answers(service, first)] == [later]
-    assert photo(service, elsewhere, "later")["searchable"]
-    assert service("GET", f"/uploads/{second}").status_code == 404
-    assert verify_store(service.catalog, store, originals=True).faults == []
-    assert (
-        recover_catalog(service.catalog, store, settings, unnamed_age_seconds=3600)
-        == RecoveryReport()
-    )
+    store.put(damaged, b"no gzip")
+    lose_catalog(service.catalog)
+    service, report = rebuilt(service)
+    assert [reason.split()[0] for reason in report.damaged_segments] == [damaged]
+    assert (report.photos, report.unnamed_photos) == (0, 1)
+    with service.catalog.read() as session:
+        assert session.scalars(select(Map.name).join(Photo, Photo.map_id == Map.id)).all() == [
+            "default"
+        ]
 
 
 def test_bytes_are_deleted_once_the_journal_has_the_deletion(
@@ -385,9 +439,9 @@ def test_bytes_are_deleted_once_the_journal_has_the_deletion(
         return len(list(store.list(ORIGINALS)))
 
     with monkeypatch.context() as patched:
-        patched.setattr(journal, "write_journal", full)
+        patched.setattr(garbage_collection, "write_journal", full)
         assert round_() == 2
-        patched.setattr(journal, "MAX_JOURNAL_WAIT_SECONDS", -1.0)
+        patched.setattr(garbage_collection, "MAX_JOURNAL_WAIT_SECONDS", -1.0)
         assert round_() == 0, "only deleting makes room in a full store"
         with service.catalog.read() as session:
             assert session.get(Photo, UUID(photos[0])) is not None, "the journal is written later"

@@ -18,12 +18,14 @@ from services.steward.tasks.orphans import (
     collect_orphans,
     empty_expired_trash,
 )
-from shared.catalog.installation import REBUILDING, get_or_create_installation
+from shared.catalog.installation import adopt_store, get_or_create_installation
 from shared.catalog.photos import Photo
 from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin
 from shared.config.settings import Settings
+from shared.errors import Misconfigured
 from shared.ids import new_id
 from shared.jobs import InProcessWakeups, Job, JobKind, JobState
+from shared.journal.outbox import write_journal
 from shared.storage.keys import (
     key_before_trash,
     new_original_key,
@@ -136,7 +138,6 @@ def test_collection_of_more_than_a_share_is_held_before_anything_is_moved(
     chunk_map: ChunkMap, settings: Settings, monkeypatch: pytest.MonkeyPatch, caplog: Any
 ) -> None:
     monkeypatch.setattr(orphans_module, "HOLD_MIN_ORPHANS", 3)
-    monkeypatch.setattr(orphans_module, "MAX_REMEMBERED_ORPHANS", 2)
     live = _live_objects(chunk_map)
     orphans = {new_original_key() for _ in range(4)}
     for key in orphans:
@@ -184,18 +185,9 @@ def test_hold_ends_by_itself_once_the_catalog_knows_the_objects_again(
     assert read_hold(chunk_map.store) is None
 
 
-def test_single_orphan_is_held_where_the_catalog_is_behind_or_adopted_the_store(
-    chunk_map: ChunkMap,
-) -> None:
+def test_single_orphan_is_held_where_the_catalog_adopted_the_store(chunk_map: ChunkMap) -> None:
     chunk_map.store.put(orphan := new_original_key(), b"orphan")
     chunk_map.age({orphan}, 2 * DAY_SECONDS)
-    with chunk_map.catalog.write() as session:
-        get_or_create_installation(session).journal_sequence = REBUILDING
-    with pytest.raises(CollectionHeld) as caught:
-        collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS)
-    assert caught.value.hold.reason == HoldReason.CATALOG_BEHIND
-    with chunk_map.catalog.write() as session:
-        get_or_create_installation(session).journal_sequence = 0
     write_hold(chunk_map.store, Hold(HoldReason.ADOPTED, 1, 6, 1))
     assert (
         collect_orphans(chunk_map.catalog, chunk_map.store, 3 * DAY_SECONDS) == 0
@@ -205,6 +197,22 @@ def test_single_orphan_is_held_where_the_catalog_is_behind_or_adopted_the_store(
     assert caught.value.hold.reason == HoldReason.ADOPTED
     assert chunk_map.objects() == {orphan}
     assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS, confirmed=True) == 1
+
+
+def test_no_orphan_is_moved_with_a_catalog_that_is_older_than_its_store(
+    chunk_map: ChunkMap,
+) -> None:
+    chunk_map.store.put(orphan := new_original_key(), b"orphan")
+    chunk_map.age({orphan}, 2 * DAY_SECONDS)
+    write_journal(chunk_map.catalog, chunk_map.store)
+    with chunk_map.catalog.write() as session:
+        get_or_create_installation(session).journal_sequence = 0
+    with pytest.raises(Misconfigured) as caught:
+        collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS, confirmed=True)
+    assert caught.value.code == "catalog_behind"
+    assert orphan in chunk_map.objects()
+    adopt_store(chunk_map.catalog, chunk_map.store)
+    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 1
 
 
 def test_an_orphan_goes_once_no_row_refers_to_it_any_more(chunk_map: ChunkMap) -> None:
@@ -254,13 +262,15 @@ def test_stray_files_stop_no_collection_and_go_with_the_orphans(chunk_map: Chunk
     assert chunk_map.objects() == live
 
 
-def test_more_orphans_than_one_look_takes_all_go(
+def test_more_orphans_than_one_run_takes_go_in_the_next_one(
     chunk_map: ChunkMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(orphans_module, "OBJECTS_PER_LOOKUP", 3)
+    monkeypatch.setattr(orphans_module, "MAX_ORPHANS_PER_RUN", 5)
     live = _live_objects(chunk_map)
     for _ in range(8):
         chunk_map.store.put(new_original_key(), b"orphan")
     chunk_map.age(chunk_map.objects(), 2 * DAY_SECONDS)
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 8
+    moved = [collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) for _ in range(3)]
+    assert moved == [5, 3, 0]
     assert chunk_map.objects() == live

@@ -14,14 +14,15 @@ import pytest
 
 from lab.evaluation.descriptor_cache import CachedDescriber
 from services.cli.operations.installation_checks import check_permissions
+from services.cli.recovery.backup import create_backup
 from services.search.chunk_loader import MappedFileCache
-from shared.backup.folder import BackedUpObject, BackupFolder, dump_rows
 from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
 from shared.config.embedded_home import announce_server, lock_home
 from shared.config.private_files import create_private_file, make_private_folder
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
+from shared.ids import new_id
 from shared.storage import FolderStore
 from shared.storage.open_store import resolve_upload_dir
 
@@ -61,14 +62,11 @@ def test_home_catalog_and_marks_are_private(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("no_umask")
 def test_backup_is_private(migrated_sqlite: Path, tmp_path: Path) -> None:
-    folder = BackupFolder(tmp_path / "backup")
-    folder.open_for_writing()
+    store = FolderStore(tmp_path / "objects")
+    store.put("thumbnails/a.jpg", b"photo")
     catalog = Catalog(f"sqlite:///{migrated_sqlite}")
-    with folder.exclusive_lock(), catalog.read() as session:
-        dump_rows(session, folder.path / "catalog-1", lambda *_: None)
-        folder.objects.put("originals/a", b"photo")
-        folder.add_to_index(BackedUpObject("originals/a", 5, "0" * 64, "2026-11-22T00:00:00+00:00"))
-        assert check_private(folder.path) > 10
+    create_backup(catalog, store, new_id(), tmp_path / "backup")
+    assert check_private(tmp_path / "backup") > 5
     catalog.close()
 
 
