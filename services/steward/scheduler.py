@@ -105,7 +105,7 @@ class Scheduler:
             *registered_tasks(resources, counting_store),
             self._journal,
             PeriodicTask(
-                "write_snapshot", 3600.0, lambda: write_snapshot(catalog, store), own_thread=True
+                "write_snapshot", 60.0, lambda: write_snapshot(catalog, store), own_thread=True
             ),
             PeriodicTask(
                 "collect_orphans",

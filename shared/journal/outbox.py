@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import Any
 
@@ -29,11 +30,12 @@ from shared.journal.segments import (
     table_of,
 )
 from shared.storage import ObjectStore
-from shared.storage.segments import list_segments, segment_key
+from shared.storage.segments import segment_key
 
 LINES_PER_SEGMENT = 5000
 TIME_LIMIT_SECONDS = 2.0  # so that the steward's other tasks run in time
 ROWS_PER_FETCH = 1000
+SNAPSHOT_SECONDS = 3600.0  # a snapshot of a million rows takes half a minute
 
 
 def write_journal(
@@ -65,15 +67,19 @@ def write_journal(
             return written
 
 
-def write_snapshot(catalog: Catalog, store: ObjectStore) -> None:
-    """Replace the store's snapshot; raises as `write_journal`."""
-    check_not_behind(catalog, store)
+def write_snapshot(
+    catalog: Catalog, store: ObjectStore, *, max_age_seconds: float = SNAPSHOT_SECONDS
+) -> None:
+    """Replace the store's snapshot if it is older than this; raises as `write_journal`."""
+    snapshots = [segment for segment in check_not_behind(catalog, store) if segment.is_snapshot]
+    oldest = datetime.now(UTC) - timedelta(seconds=max_age_seconds)
+    if any(snapshot.modified_at > oldest for snapshot in snapshots):
+        return
     number = _take_number(catalog)
     with catalog.with_timeouts(NO_TIMEOUTS).read() as session:
         put_lines(store, segment_key(number, number, snapshot=True), snapshot_lines(session))
-    for segment in list_segments(store):
-        if segment.is_snapshot and segment.last < number:
-            store.delete(segment.key)
+    for replaced in snapshots:
+        store.delete(replaced.key)
 
 
 def snapshot_lines(session: Session) -> Iterator[Line]:

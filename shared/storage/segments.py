@@ -14,7 +14,8 @@ from shared.ids import new_id
 from shared.storage.keys import JOURNAL
 from shared.storage.protocol import ObjectStore
 
-KEY = re.compile(rf"{JOURNAL}(\d{{12}})-(\d{{12}})-[0-9a-f-]{{36}}(-snapshot)?\.jsonl\.gz")
+ENDING, SNAPSHOT_ENDING = ".jsonl.gz", "-snapshot.jsonl.gz"
+KEY = re.compile(rf"{JOURNAL}(\d{{12}})-(\d{{12}})-[0-9a-f-]{{36}}({SNAPSHOT_ENDING}|{ENDING})")
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -38,7 +39,7 @@ def list_segments(store: ObjectStore) -> list[Segment]:
             info.key,
             info.size_bytes,
             info.modified_at,
-            match[3] is not None,
+            match[3] == SNAPSHOT_ENDING,
         )
         for info in store.list(JOURNAL)
         if (match := KEY.fullmatch(info.key))
@@ -47,4 +48,4 @@ def list_segments(store: ObjectStore) -> list[Segment]:
 
 def segment_key(first: int, last: int, *, snapshot: bool = False) -> str:
     """Return a new key for a segment with these sequence numbers."""
-    return f"{JOURNAL}{first:012}-{last:012}-{new_id()}{'-snapshot' * snapshot}.jsonl.gz"
+    return f"{JOURNAL}{first:012}-{last:012}-{new_id()}{SNAPSHOT_ENDING if snapshot else ENDING}"

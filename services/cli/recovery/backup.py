@@ -53,7 +53,7 @@ from shared.storage.keys import (
     is_original_key,
 )
 from shared.storage.protocol import ObjectInfo
-from shared.storage.segments import list_segments, segment_key
+from shared.storage.segments import SNAPSHOT_ENDING, list_segments, segment_key
 
 BACKUP_FORMAT = 2
 MAX_SNAPSHOTS = 5  # of the catalog, when the journal is merged meanwhile
@@ -263,7 +263,11 @@ class _Backup:
 
     def _copy_all(self, stage: str) -> set[str]:
         """Copy every object that is new or has changed; return the keys of all but the journal."""
-        objects = list(list_backup_objects(self._store))
+        objects = [
+            info
+            for info in list_backup_objects(self._store)
+            if not info.key.endswith(SNAPSHOT_ENDING)  # the backup has its own
+        ]
         for done, info in enumerate(objects, start=1):
             with contextlib.suppress(NotFound):  # deleted since it was listed
                 self._copy(info)

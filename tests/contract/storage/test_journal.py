@@ -189,7 +189,7 @@ def test_many_segments_become_one_with_the_last_states(
     catalog: Catalog, store: ObjectStore
 ) -> None:
     _, photo_id = filled(catalog)
-    write_snapshot(catalog, store)  # is not merged
+    write_snapshot(catalog, store, max_age_seconds=0)  # is not merged
     for number in range(9):
         with catalog.write() as session:
             session.get_one(Photo, photo_id).place = f"place {number}"
@@ -217,8 +217,10 @@ def test_a_snapshot_has_what_the_journal_lacks_and_replaces_the_one_before(
         add_job(session, map_id, JobKind.DESCRIBE)
         evaluation = add_job(session, map_id, JobKind.EVALUATE, state=JobState.SUCCEEDED).id
     for _ in range(2):
-        write_snapshot(catalog, store)
+        write_snapshot(catalog, store, max_age_seconds=0)
     segment, snapshot = list_segments(store)
+    write_snapshot(catalog, store)
+    assert list_segments(store) == [segment, snapshot], "it is young enough"
     assert (segment.is_snapshot, snapshot.is_snapshot) == (False, True)
     lines = list(read_lines(store, snapshot.key))
     assert [line.id for line in lines if line.table in TABLES] == [photo_id]

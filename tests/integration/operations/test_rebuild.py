@@ -248,7 +248,7 @@ def test_history_of_the_last_snapshot_and_reports_and_keys_come_back_but_no_work
         add_job(session, generation.map_id, JobKind.EVALUATE)
     read = ("/searches", "/tracks", "/evaluations")
     before = [service.json("GET", path) for path in read]
-    write_snapshot(service.catalog, store)
+    write_snapshot(service.catalog, store, max_age_seconds=0)
     service.json("PATCH", f"/uploads/{file_id}", json={"place": "later"})
     write_journal(service.catalog, store)
     lose_catalog(service.catalog)
@@ -270,7 +270,7 @@ def test_a_model_change_of_a_snapshot_that_nothing_follows_is_finished(
     advance_model_changes(service.catalog, InProcessWakeups())  # queues the photos
     service.worker.drain(threading.Event())
     write_journal(service.catalog, store)
-    write_snapshot(service.catalog, store)
+    write_snapshot(service.catalog, store, max_age_seconds=0)
     building = select(Generation.id).where(Generation.state == GenerationState.BUILDING)
     with service.catalog.read() as session:
         generation_id = session.scalars(building).one()
@@ -295,7 +295,7 @@ def test_photos_that_were_described_after_the_last_snapshot_are_not_described_ag
     service.indexed(1)
     sent = service.upload(photo_bytes(2))
     write_journal(service.catalog, store)
-    write_snapshot(service.catalog, store)
+    write_snapshot(service.catalog, store, max_age_seconds=0)
     service.drain()
     lose_catalog(service.catalog)
     service, report = rebuilt(service)
