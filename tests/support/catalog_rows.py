@@ -37,7 +37,7 @@ PRIORITIES = {
     JobKind.COMPARE: Priority.QUERY,
     JobKind.EVALUATE: Priority.EVALUATION,
     JobKind.WORD_WEIGHTS: Priority.EVALUATION,
-    **dict.fromkeys(MODEL_CHANGE_JOBS, Priority.MODEL_CHANGE),
+    **dict.fromkeys((*MODEL_CHANGE_JOBS, JobKind.ADD_MODEL), Priority.MODEL_CHANGE),
 }
 
 
