@@ -47,7 +47,7 @@ def compare_photos(context: ExtractorContext, batch: JobBatch) -> Iterator[None]
     """Prepare and compare the query of a claimed job; PlacewiseError if that can't be done."""
     job = batch.jobs[0]
     request = CompareRequest.model_validate(job.params["request"])
-    target = resolve_generation(context.catalog, context.store, context.models, job)
+    target = resolve_generation(context, job)
     assert target is not None, "a compare job names an existing generation"
     if request.rerank:
         check_rerankable(target.extractor.config)

@@ -46,7 +46,7 @@ PREVIEWS_BY_KIND = {JobKind.INDEX: Previews.ALL, JobKind.DESCRIBE: Previews.OTHE
 @handles(JobKind.INDEX, JobKind.REINDEX, JobKind.DESCRIBE)
 def describe_photos(context: ExtractorContext, batch: JobBatch) -> Iterator[None]:
     """Prepare, describe and publish the photos of claimed jobs."""
-    target = resolve_generation(context.catalog, context.store, context.models, batch.jobs[0])
+    target = resolve_generation(context, batch.jobs[0])
     if target is None:
         requeue_until_vocabulary(context.catalog, batch)
         return

@@ -17,7 +17,7 @@ from uuid import UUID
 
 from sqlalchemy import select
 
-from services.extractor.handlers import JobBatch
+from services.extractor.handlers import ExtractorContext, JobBatch
 from services.extractor.model_registry import (
     DescriptorPipeline,
     ModelRegistry,
@@ -39,7 +39,6 @@ from shared.jobs import Job, JobKind
 from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.model_changes import start_model_change, wake_vocabulary_waiters
 from shared.jobs.transitions import fail_job, requeue_job
-from shared.storage import ObjectStore
 from shared.storage.keys import new_vocabulary_key
 
 log = logging.getLogger(__name__)
@@ -52,9 +51,7 @@ class ResolvedGeneration(DescriptorPipeline):
     generation: Generation
 
 
-def resolve_generation(
-    catalog: Catalog, store: ObjectStore, models: ModelRegistry, job: Job
-) -> ResolvedGeneration | None:
+def resolve_generation(context: ExtractorContext, job: Job) -> ResolvedGeneration | None:
     """Return the generation for the batch of `job`; None while the map waits for a vocabulary.
 
     A job that names a generation gets that one; other jobs get the map's active one, which is
@@ -64,18 +61,18 @@ def resolve_generation(
     Raises:
         Unavailable: `spec_differs` if this worker can't reproduce the generation's spec.
     """
-    with catalog.read() as session:
+    with context.catalog.read() as session:
         if job.generation_id is not None:
             generation = session.get(Generation, job.generation_id)
         else:
             generation = active_generation(session, job.map_id)
         map_extractor = session.get_one(Map, job.map_id).extractor
     if generation is None:
-        extractor = models.extractor(map_extractor)
-        generation = _create_first_generation(catalog, store, models, extractor, job.map_id)
+        extractor = context.models.extractor(map_extractor)
+        generation = _create_first_generation(context, extractor, job.map_id)
         if generation is None:
             return None
-    pipeline = models.pipeline_of_generation(catalog, generation)
+    pipeline = context.models.pipeline_of_generation(context.catalog, generation)
     target = ResolvedGeneration(
         pipeline.extractor, pipeline.centres, pipeline.projection, generation=generation
     )
@@ -85,11 +82,7 @@ def resolve_generation(
 
 
 def _create_first_generation(
-    catalog: Catalog,
-    store: ObjectStore,
-    models: ModelRegistry,
-    extractor: Extractor,
-    map_id: UUID,
+    context: ExtractorContext, extractor: Extractor, map_id: UUID
 ) -> Generation | None:
     """Create the map's first generation, with the shipped vocabulary if one is needed.
 
@@ -101,13 +94,13 @@ def _create_first_generation(
     """
     shipped = extractor.shipped_vocabulary()
     if extractor.config.needs_vocabulary and shipped is None:
-        if not models.pool_without_vocabulary:
+        if not context.settings.pool_without_vocabulary:
             return None
-        extractor = models.extractor(pooled_config(extractor.config).name)
+        extractor = context.models.extractor(pooled_config(extractor.config).name)
     key = new_vocabulary_key()
     if shipped is not None:
-        store.put(key, encode_centres(shipped[0]))
-    with catalog.write() as session:
+        context.store.put(key, encode_centres(shipped[0]))
+    with context.catalog.write() as session:
         map_ = lock_map(session, map_id)
         existing = active_generation(session, map_id)
         if existing is not None:  # another worker has created it

@@ -83,11 +83,6 @@ class ModelRegistry:
         self._centres: LRUCache[UUID, ClusterCentres] = LRUCache(MAX_VOCABULARIES)
         self._projections: LRUCache[UUID, PcaProjection] = LRUCache(MAX_WHITENINGS)
 
-    @property
-    def pool_without_vocabulary(self) -> bool:
-        """Whether maps begin with pooled descriptors until they have a vocabulary."""
-        return self._settings.pool_without_vocabulary
-
     def extractor(self, name: str, precision: Precision | None = None) -> Extractor:
         """Return the extractor called `name` with its weights loaded.
 

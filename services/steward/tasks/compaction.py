@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import random
+from dataclasses import asdict
 from uuid import UUID
 
 import numpy as np
@@ -125,11 +126,8 @@ def merge_slot(
                     id=chunk_id,
                     generation_id=generation_id,
                     slot=slot,
-                    object_key=new_chunk.object_key,
-                    rows=new_chunk.rows,
-                    size_bytes=new_chunk.size_bytes,
-                    sha256=new_chunk.sha256,
                     sealed=True,
+                    **asdict(new_chunk),
                 )
             )
             session.flush()
