@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import gzip
 import io
-import json
 import random
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from PIL import Image
 
@@ -25,19 +24,17 @@ NO_PHOTO = frozenset({"unsupported_photo"})
 BROKEN = frozenset({"undecodable_photo", "unsupported_photo"})
 TOO_LARGE = frozenset({"too_many_pixels", "undecodable_photo"})
 ANY_OUTCOME = SUCCEEDED | BROKEN | TOO_LARGE
-BAD_FIELD = frozenset({"invalid_field"})
 
 
 @dataclass(frozen=True, slots=True)
 class HostileFile:
-    """One file; `fields` are those of the form beside it."""
+    """One file of the corpus."""
 
     name: str
     data: bytes
     allowed: frozenset[str]
     """Error codes, and `succeeded` where its photo may be indexed."""
     filename: str = "photo.jpg"
-    fields: dict[str, str] = field(default_factory=dict)
 
 
 def photo(number: int, media: str = "JPEG") -> bytes:
@@ -283,37 +280,6 @@ def names() -> Iterator[HostileFile]:
     yield HostileFile("a name of 5000 letters", photo(149), too_long, filename="x" * 5000 + ".jpg")
 
 
-def fields() -> Iterator[HostileFile]:
-    bad = (
-        {"latitude": "nan", "longitude": "nan"},
-        {"latitude": "inf", "longitude": "0"},
-        {"latitude": "-inf", "longitude": "0"},
-        {"latitude": "1e999", "longitude": "0"},
-        {"latitude": "91", "longitude": "0"},
-        {"latitude": "0", "longitude": "181"},
-        {"latitude": "0"},
-        {"longitude": "0"},
-        {"latitude": "0x10", "longitude": "0"},
-        {"latitude": "45,07", "longitude": "7,69"},
-        {"latitude": "\0", "longitude": "0"},
-        {"heading": "nan"},
-        {"heading": "-1"},
-        {"captured_at": "yesterday"},
-        {"captured_at": "9999999-01-01"},
-        {"place": "a\0b"},
-        {"tags": "a\0b"},
-        {"metadata": "[]"},
-        {"metadata": "{"},
-        {"metadata": '{"a": "\\u0000"}'},
-        {"metadata": '{"a":' * 100 + "1" + "}" * 100},
-        {"role": "admin"},
-    )
-    for number, fields in enumerate(bad):
-        yield HostileFile(
-            f"fields {json.dumps(fields)[:50]}", photo(150 + number), BAD_FIELD, fields=fields
-        )
-
-
 def archives() -> Iterator[HostileFile]:
     members = {f"{n}.jpg": photo(200 + n) for n in range(3)}
     for name, data in (("zip", zip_of(members)), ("tar.gz", tar_of(members, "w:gz"))):
@@ -332,6 +298,5 @@ def corpus() -> list[HostileFile]:
         *exif(),
         *noise(),
         *names(),
-        *fields(),
         *archives(),
     ]

@@ -298,6 +298,7 @@ def test_a_bad_upload_is_refused_and_leaves_nothing(
 def test_a_bad_field_is_refused_by_name_and_leaves_nothing(server: ServerProcess) -> None:
     before = stored(server)
     field_refused(server.upload(JPEG, latitude="91", longitude="7"), "latitude")
+    field_refused(server.upload(JPEG, role="admin"), "role")
     check_nothing_is_left(server, before)
 
 
