@@ -160,7 +160,7 @@ def pairs(
             for match in matches:
                 file.write(f"{_photo_name(photo, names)} {_photo_name(match, names)}\n".encode())
     print_result(
-        {"file": str(out), "asked": len(queries), "pairs": count, "passed_over": skipped},
+        {"file": str(out), "queries": len(queries), "pairs": count, "skipped": skipped},
         as_json,
         f"{out}: {count} pairs for {len(queries)} queries, {skipped} of them without a descriptor.",
     )
@@ -235,7 +235,7 @@ def geojson(
         features.end()
     found = len(queries) - skipped
     print_result(
-        {"file": str(out), "photos": photos, "estimates": found, "passed_over": skipped},
+        {"file": str(out), "photos": photos, "estimates": found, "skipped": skipped},
         as_json,
         f"{out}: {photos} photos, {found} estimates.",
     )

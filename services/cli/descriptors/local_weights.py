@@ -70,7 +70,7 @@ class LocalWeights:
     source: str
     licence: str
     """Licence stated by the publisher or in the folder of the code, or `none found`."""
-    here: bool = False
+    available: bool = False
     """Whether the extractor can be loaded without the network."""
     note: str | None = None
     """Why the weights are not available."""
@@ -118,7 +118,7 @@ def inspect_weights(
     weights = LocalWeights(config.name, source, found.licence, path=str(found.path))
     if known is None:
         return replace(weights, note=NEVER_LOADED)
-    return replace(weights, here=True, **asdict(known))
+    return replace(weights, available=True, **asdict(known))
 
 
 def _has_local_weights(config: ExtractorConfig, settings: Settings) -> bool:

@@ -162,7 +162,7 @@ def list_(as_json: JsonOption = False) -> None:
     for weights in all_weights:
         table.add_row(
             escape(weights.extractor),
-            "yes" if weights.here else "no",
+            "yes" if weights.available else "no",
             _format_megabytes(weights.size_bytes),
             escape(weights.source),
             escape(weights.licence),
@@ -206,7 +206,7 @@ def fetch(
         found = loaded.find_weights(config, settings.dino_weights)
         save_record(found.key, WeightsRecord(loaded.fingerprint, loaded.card["size_bytes"]))
     weights = inspect_weights(config, settings)
-    if not weights.here:
+    if not weights.available:
         raise Misconfigured("weights_unusable", weights.note or "")
     if as_json:
         print_json({**asdict(weights), "dimension": dimension})

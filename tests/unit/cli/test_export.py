@@ -70,7 +70,7 @@ def test_pairs_are_those_of_the_labelled_queries_best_match_first(
     will_find(server, "b.jpg", "a.jpg")
     report = export(server, "pairs", "--out", out, "--top-k", "2")
     assert out.read_text() == "q.jpg b.jpg\nq.jpg a.jpg\n"
-    assert report == {"file": str(out), "asked": 1, "pairs": 2, "passed_over": 0}
+    assert report == {"file": str(out), "queries": 1, "pairs": 2, "skipped": 0}
     assert "top_k=2" in server.requests[1][1]
 
 
@@ -83,7 +83,7 @@ def test_a_map_without_queries_pairs_its_own_photos_but_those_without_a_descript
     server.will_answer(409, Conflict("not_searchable", "Not now.").as_problem())
     report = export(server, "pairs", "--out", out, "--names", "id")
     assert out.read_text() == f"{photo_id('a.jpg')} {photo_id('b.jpg')}\n"
-    assert report["passed_over"] == 1
+    assert report["skipped"] == 1
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_geojson_has_longitude_first_and_an_estimate_for_each_query(
     assert query["geometry"] is None
     assert estimate["properties"]["query"] == query["id"]
     assert estimate["geometry"]["coordinates"] == [7.25, 45.5]
-    assert report == {"file": str(out), "photos": 2, "estimates": 1, "passed_over": 0}
+    assert report == {"file": str(out), "photos": 2, "estimates": 1, "skipped": 0}
 
 
 def test_geojson_of_an_empty_map_is_an_empty_collection(server: FakeServer, tmp_path: Path) -> None:

@@ -90,10 +90,10 @@ def repository_zip(tmp_path: Path, comment: str = COMMIT) -> bytes:
 def test_list_says_what_is_here_and_how_to_get_what_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("EXTRACTOR")
     here = listed("efficientnet-lite0-vlad")
-    assert (here["here"], here["licence"]) == (True, "Apache-2.0")
+    assert (here["available"], here["licence"]) == (True, "Apache-2.0")
     assert here["size_bytes"] == Path(here["path"]).stat().st_size
     missing = listed("anyloc-vitg14")
-    assert (missing["here"], missing["path"], missing["fingerprint"]) == (False, None, None)
+    assert (missing["available"], missing["path"], missing["fingerprint"]) == (False, None, None)
     assert "timm/vit_giant_patch14_dinov2.lvd142m" in missing["source"]
     assert "placewise models fetch anyloc-vitg14" in missing["note"]
     assert not [w for w in command("list") if w["extractor"].startswith("test-")]
@@ -117,7 +117,7 @@ def test_fingerprint_is_that_of_the_spec_and_is_computed_once(
     assert found["fingerprint"] == Dinov2("vits14", 0, "value", CPU, file).fingerprint
     assert found["source"] == "DINO_WEIGHTS"
     other = listed("anyloc-vitb14")
-    assert not other["here"]
+    assert not other["available"]
     assert "these look like the weights of dinov2-vits14" in other["note"]
 
     read: list[Path] = []
@@ -149,7 +149,7 @@ def test_a_broken_memory_of_fingerprints_is_made_anew(caches: Path) -> None:
 def test_weights_are_fetched_ahead_of_time(server: FilesServer, vits_weights: bytes) -> None:
     fetched = command("fetch", VITS)
     assert Path(fetched["path"]).read_bytes() == vits_weights
-    assert (fetched["here"], fetched["dimension"]) == (True, 64 * 384)
+    assert (fetched["available"], fetched["dimension"]) == (True, 64 * 384)
     backbone = Dinov2("vits14", 0, "value", CPU)
     assert backbone.fingerprint == fetched["fingerprint"]
 
@@ -180,7 +180,7 @@ def test_a_file_that_is_not_what_the_hub_promises_is_refused(
     assert refused["code"] == "download_corrupt"
     retained = [p for p in (caches / "huggingface").rglob("*") if p.is_file()]
     assert [p for p in retained if p.stat().st_size > 0] == []
-    assert not listed("anyloc-vits14")["here"]
+    assert not listed("anyloc-vits14")["available"]
 
 
 def test_weights_of_another_network_are_refused_when_they_are_fetched(
@@ -219,13 +219,13 @@ def test_a_repository_is_fetched_at_its_commit_and_tried(
     monkeypatch.setenv("TORCHHUB_ALLOWED", f"{REPOSITORY}  {REPOSITORY}:dimension=8")
     server.files.clear()
     found = listed(REPOSITORY)
-    assert (found["here"], found["fingerprint"]) == (True, fetched["fingerprint"])
+    assert (found["available"], found["fingerprint"]) == (True, fetched["fingerprint"])
     other = listed(f"{REPOSITORY}:dimension=8")
-    assert not other["here"], "its code is here, and was never loaded that way"
+    assert not other["available"], "its code is here, and was never loaded that way"
     assert "placewise models fetch" in other["note"]
 
     (Path(fetched["path"]) / "networks.py").write_text("changed = True")
-    assert not listed(REPOSITORY)["here"]
+    assert not listed(REPOSITORY)["available"]
 
 
 def test_weights_of_an_entry_come_by_a_download_that_goes_on(
@@ -239,7 +239,7 @@ def test_weights_of_an_entry_come_by_a_download_that_goes_on(
     hubconf = folder / "hubconf.py"
     hubconf.write_text(hubconf.read_text().replace("http://127.0.0.1:9", server.url))
     fetched = command("fetch", f"torchhub:{folder}:from_network")
-    assert fetched["here"]
+    assert fetched["available"]
     assert server.requests == [("/weights.pth", None), ("/weights.pth", "bytes=10000-")]
     assert (caches / "torch" / "hub" / "checkpoints" / "weights.pth").exists()
 
