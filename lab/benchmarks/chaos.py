@@ -69,7 +69,7 @@ def all_faults() -> list[Fault]:
         ),
         _pause("an extractor stands still beyond its lease", "extractor-0"),
         _pause("a search worker stands still", "search-0-0"),
-        Fault("FLUSHALL", lambda fleet, _: _broken(*[partial(_flush, fleet)] * 2)),
+        Fault("FLUSHALL", lambda fleet, _: _broken(partial(_flush, fleet), partial(_flush, fleet))),
         _stop("Redis stopped", "Redis"),
         Fault("every message doubled", _duplicate_messages),
         Fault("PostgreSQL killed and started", _restart_postgres),

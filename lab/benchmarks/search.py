@@ -22,8 +22,8 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from statistics import median
 from typing import Annotated, Any
 from uuid import UUID
 
@@ -464,25 +464,23 @@ def measure_growth(report: Report, progress: Progress, sizes: Sequence[int] = GR
         words = codes.ravel()
         parts = np.array_split(words, cores)
         _xor_words(words[:8])  # compiles
-        scans, alone, together = [], [], []
+        seconds = np.empty((GROWTH_ROUNDS, 3))
         with ThreadPoolExecutor(cores, thread_name_prefix="read") as pool:
-            for _ in range(GROWTH_ROUNDS):
-                times = [time.perf_counter()]
-                for work in (
-                    scan,
-                    lambda words=words: _xor_words(words),
-                    lambda parts=parts: list(pool.map(_xor_words, parts)),
-                ):
+            works = scan, partial(_xor_words, words), partial(_read_together, pool, parts)
+            for of_round in seconds:
+                for number, work in enumerate(works):
+                    started_at = time.perf_counter()
                     work()
-                    times.append(time.perf_counter())
-                for durations, seconds in zip(
-                    (scans, alone, together), np.diff(times).tolist(), strict=True
-                ):
-                    durations.append(seconds)
+                    of_round[number] = time.perf_counter() - started_at
                 progress.advance(task)
-        report.add_latency(f"growth: scan of {rows:,} codes", scans)
-        ratio = median(scans) / min(median(alone), median(together))
+        report.add_latency(f"growth: scan of {rows:,} codes", seconds[:, 0].tolist())
+        scanning, alone, together = np.median(seconds, axis=0).tolist()
+        ratio = scanning / min(alone, together)
         report.add(f"growth: {rows:,} codes, time / reading", ratio, "x", at_most=TARGET_RATIO)
+
+
+def _read_together(pool: ThreadPoolExecutor, parts: Sequence[Words]) -> None:
+    list(pool.map(_xor_words, parts))
 
 
 def _make_scan(rows: int) -> tuple[Words, Callable[[], object]]:

@@ -44,7 +44,8 @@ def take_photo(
     whole = Image.frombuffer("RGBX", texels.shape[::-1], texels, "raw", "RGBX", 0, 1)
     colours = np.asarray(whole.reduce(SUPERSAMPLING))[..., :3] * np.float32(1 / 255)
     cover = _mean(texels >= FIRST_SOLID)[..., None]
-    codes, nearness, sun = (each[::2, ::2] for each in (texels >> 24, canvas.nearness, canvas.sun))
+    codes = texels[::2, ::2] >> 24
+    nearness, sun = canvas.nearness[::2, ::2], canvas.sun[::2, ::2]
     flat = codes == CODE_FLAT
     if session.snow:
         colours[flat] += session.snow * (0.48 - 0.47 * colours[flat])
@@ -72,7 +73,7 @@ def _mean(samples: NDArray[Any]) -> Light:
     total = samples[::2, ::2].astype(np.float32)
     for i, j in ((0, 1), (1, 0), (1, 1)):
         total += samples[i::2, j::2]
-    return total / 4
+    return total * np.float32(1 / 4)
 
 
 def encode_jpeg(photo: Image.Image, session: CaptureSession) -> bytes:
@@ -84,8 +85,8 @@ def encode_jpeg(photo: Image.Image, session: CaptureSession) -> bytes:
 
 def _directions(camera: Camera, shown: NDArray[np.bool_]) -> Light:
     """Return the (n, 3) directions of the pixels that a mask selects, one metre deep."""
-    rows, columns = shown.nonzero()
-    return camera.rays(columns + 0.5, rows + 0.5).astype(np.float32)
+    rows, columns = (index + np.float64(0.5) for index in shown.nonzero())
+    return camera.rays(columns, rows).astype(np.float32)
 
 
 def _lamplight(camera: Camera, nearness: Light, lamps: Sequence[Floats]) -> Light:

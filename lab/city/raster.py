@@ -51,7 +51,8 @@ class Texture:
         widths = self.widths.take(level)
         index = (t * self.heights.take(level)).astype(np.int32) * widths
         index += (s * widths).astype(np.int32)
-        return self._texels.take(index + self._offsets.take(level))
+        found: Packed = self._texels.take(index + self._offsets.take(level))
+        return found
 
 
 def _halve(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -60,7 +61,7 @@ def _halve(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     padded = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
     quads = [padded[i::2, j::2] for i in (0, 1) for j in (0, 1)]
     count = np.sum([quad[..., 3] > 0 for quad in quads], axis=0)
-    half = np.max(quads, axis=0)
+    half: NDArray[np.uint8] = np.max(quads, axis=0)
     half[count < 2, 3] = 0
     total = np.sum([quad[..., :3] * (quad[..., 3:] > 0) for quad in quads], axis=0, dtype=np.uint16)
     half[..., :3] = total // np.maximum(count, 1)[..., None].astype(np.uint16)
@@ -144,9 +145,8 @@ class Canvas:
                 seen.append((a[0] / a[2], a[1] / a[2]))
             if (a[2] > NEAREST_M) != (b[2] > NEAREST_M):
                 share = (NEAREST_M - a[2]) / (b[2] - a[2])
-                seen.append(
-                    [(p + (q - p) * share) / NEAREST_M for p, q in zip(a, b, strict=True)][:2]
-                )
+                x, y = (a[n] + (b[n] - a[n]) * share for n in (0, 1))
+                seen.append((x / NEAREST_M, y / NEAREST_M))
         if not seen:
             return None
         scale = self.camera.focal * SUPERSAMPLING

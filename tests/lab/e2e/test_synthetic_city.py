@@ -167,11 +167,7 @@ def test_folder_that_cannot_be_made_is_an_error_that_names_it(command: Command, 
     "wrong",
     [
         ("--places", "0"),
-        ("--views", "0"),
-        ("--queries", "0"),
         ("--out-of-map", "1.5"),
-        ("--seed", "-1"),
-        ("--size", "320"),
         ("--size", "9999x10"),
     ],
 )

@@ -22,7 +22,7 @@ def test_random_weights_are_named_and_the_passes_to_the_used_layer_counted(
     arguments = "--extractor anyloc-vits14:layer=1 --photos 2 --device cpu --batch 2 --rounds 1"
     ended = runner.invoke(app, ["bench", "extract", *arguments.split(), "--json"])
     assert ended.exit_code == 0
-    report = json.loads(ended.output)
+    report = json.loads(ended.stdout)
     assert "random weights" in report["title"]
     assert report["random_weights"]
     found = {figure["what"]: figure["measured"] for figure in report["figures"]}

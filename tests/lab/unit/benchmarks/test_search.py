@@ -119,7 +119,7 @@ def test_whole_run_finds_no_wrong_answer_and_measures_everything(tmp_path: Path)
             *["--folder", str(tmp_path), "--json"],
         ],
     )
-    report = json.loads(ended.output)
+    report = json.loads(ended.stdout)
     figures = {figure["what"]: figure["measured"] for figure in report["figures"]}
     assert figures["60 x 7,168: wrong results of Placewise"] == 0
     assert figures["cold: wrong results"] == 0

@@ -10,7 +10,6 @@ from lab.city import write
 from lab.city.plan import CityOptions, make_plan
 from lab.city.write import TrainingLayoutName, with_training_layout
 from lab.datasets.open_dataset import open_training_set
-from shared.errors import Conflict
 
 PLAN = make_plan(CityOptions(2, 4, 4, 1, 2, 0.25, 64, 64))
 
@@ -51,16 +50,3 @@ def test_same_photos_can_be_laid_out_as_either_training_set(tmp_path: Path) -> N
     assert contents(tmp_path / TrainingLayoutName.GSV_XS / "queries") == contents(
         tmp_path / TrainingLayoutName.GSV_CITIES / "queries"
     )
-
-
-def test_folder_that_holds_anything_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(Conflict) as caught:
-        write.write_city(PLAN, tmp_path)
-    assert caught.value.code == "out_not_empty"
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
-
-
-def test_empty_folder_may_be_written_into(tmp_path: Path) -> None:
-    write.check_output_empty(tmp_path)
-    write.check_output_empty(tmp_path / "not there yet")
