@@ -466,7 +466,11 @@ def measure_growth(report: Report, progress: Progress, sizes: Sequence[int] = GR
         _xor_words(words[:8])  # compiles
         seconds = np.empty((GROWTH_ROUNDS, 3))
         with ThreadPoolExecutor(cores, thread_name_prefix="read") as pool:
-            works = scan, partial(_xor_words, words), partial(_read_together, pool, parts)
+            works: list[Callable[[], object]] = [
+                scan,
+                partial(_xor_words, words),
+                partial(_read_together, pool, parts),
+            ]
             for of_round in seconds:
                 for number, work in enumerate(works):
                     started_at = time.perf_counter()

@@ -107,7 +107,7 @@ def verify_store(
     with catalog.read() as session:
         referenced = list(list_referenced_objects(session))
     total, done = Counter(one.what for one in referenced), Counter[ObjectKind]()
-    faults = []
+    faults: list[IntegrityFault] = []
     for one in referenced:
         if one.what != ObjectKind.MANIFEST:  # verified with its chunk
             faults += filter(None, [verifier.verify(one)])

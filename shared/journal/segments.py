@@ -110,9 +110,9 @@ class Line:
 
 def table_of(name: str) -> Table:
     """Return the table of this name; KeyError for one that is not in the journal."""
-    table = (TABLES.get(name) or SNAPSHOT_TABLES[name]).__table__  # type: ignore[attr-defined]
-    assert isinstance(table, Table)
-    return table
+    if name not in TABLES and name not in SNAPSHOT_TABLES:
+        raise KeyError(name)
+    return Base.metadata.tables[name]
 
 
 # Those that a row can't be inserted or recovered without.

@@ -237,7 +237,7 @@ def test_a_catalog_that_is_older_than_its_store_writes_nothing_and_no_process_st
     filled(catalog)
     for refused in (check_not_behind, write_journal, write_snapshot):
         with pytest.raises(Misconfigured) as caught:
-            refused(catalog, store)  # type: ignore[operator]
+            refused(catalog, store)
         assert caught.value.code == "catalog_behind"
         assert f"{list_segments(store)[0].modified_at:%H:%M:%S} UTC" in caught.value.detail
         assert "storage rebuild" in caught.value.detail

@@ -200,13 +200,18 @@ def test_a_backup_taken_again_copies_only_what_is_new_and_forgets_what_is_gone(
     first, _ = service.indexed(1, 2)
     back_up()
     read: list[str] = []
-    back_up(lambda method, key: method == "open" and read.append(key))
+
+    def on_call(method: str, key: str) -> None:
+        if method == "open":
+            read.append(key)
+
+    back_up(on_call)
     assert read == []
     gone = original_of(service, first)
     assert service("DELETE", f"/uploads/{first}").is_success
     service.store.delete(gone)  # as the steward does
     service.upload(photo_bytes(3))
-    manifest = back_up(lambda method, key: method == "open" and read.append(key))
+    manifest = back_up(on_call)
     assert [key.split("/")[0] for key in read] == ["originals"]
     folder = BackupFolder(tmp_path / "backup")
     _, index = open_backup(folder)

@@ -197,13 +197,13 @@ def test_a_rebuild_that_was_killed_goes_on_and_a_full_catalog_is_refused(
             with pytest.raises(KeyboardInterrupt):
                 rebuild_catalog(
                     service.catalog,
-                    dying,  # type: ignore[arg-type]
+                    dying,
                     service.settings,
                     with_unnamed=True,
                 )
         for refused in (check_not_behind, write_snapshot, partial(collect_orphans, age_seconds=-1)):
             with pytest.raises(Misconfigured) as unfinished:
-                refused(service.catalog, store)  # type: ignore[operator]
+                refused(service.catalog, store)
             assert unfinished.value.code == "rebuild_unfinished"
     assert rebuild(service).photos == 3
     with service.catalog.read() as session:
