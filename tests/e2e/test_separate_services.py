@@ -232,9 +232,9 @@ def test_an_extractor_that_has_never_seen_a_model_fetches_it(
         ("extractor", ["heartbeat", "wakeups"]),
         (
             "steward",
-            ["wakeups", "steward", "collect orphans", "evaluator", "batches", "webhooks"],
+            ["wakeups", "steward", "collect_orphans", "evaluator", "batches", "webhooks"],
         ),
-        ("serve", ["search", "extractor", "steward", "collect orphans"]),
+        ("serve", ["search", "extractor", "steward", "collect_orphans"]),
     ],
 )
 def test_a_thread_that_crashes_ends_its_process(
