@@ -24,7 +24,6 @@ from shared.descriptors.backbones.torchhub import module_fingerprint
 from shared.jobs import InProcessWakeups
 from shared.storage.keys import CHECKPOINTS, MODELS
 from tests.integration.in_process_api import Service
-from tests.integration.workplace import same
 from tests.support.catalog_rows import end_pauses, stored_rows
 from tests.support.checkpoints import (
     MEAN,
@@ -193,15 +192,13 @@ def without_a_layer() -> bytes:
 @pytest.mark.parametrize(
     ("make", "code"),
     [
-        (lambda: b"no checkpoint at all", "checkpoint_unreadable"),
         (lambda: some_checkpoint()[:5000], "checkpoint_unreadable"),
         (with_code, "checkpoint_unreadable"),
-        (lambda: saved({"state_dict": {}}), "checkpoint_unusable"),
         (without_a_layer, "checkpoint_unusable"),
         (with_nan, "model_unusable"),
         (of_zeros, "model_unusable"),
     ],
-    ids=["text", "torn", "code", "other", "layer", "nan", "zeros"],
+    ids=["torn", "code", "layer", "nan", "zeros"],
 )
 def test_a_checkpoint_that_can_not_be_used_fails_with_the_reason_and_leaves_nothing(
     service: Service,
@@ -234,14 +231,7 @@ def test_a_checkpoint_is_kept_until_it_was_looked_at(service: Service) -> None:
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [
-        ("name", "a/b"),
-        ("name", ""),
-        ("name", "-begins"),
-        ("licence", "x" * 1001),
-        ("note", "nul \x00"),
-        ("tags", "spring"),
-    ],
+    [("name", "a/b"), ("licence", "x" * 1001), ("note", "nul \x00"), ("tags", "spring")],
 )
 def test_metadata_of_a_model_is_validated(service: Service, field: str, value: str) -> None:
     fields = {"name": "walks", field: value}
@@ -285,24 +275,6 @@ def test_a_map_is_described_as_the_model_itself_describes(walks: Service) -> Non
         == PHOTOS
     )
     assert body["maps"] == ["new"]
-
-
-def test_a_map_switches_to_a_model_and_back_while_it_answers(walks: Service) -> None:
-    before = active(walks)
-    old_rows = list(stored_rows(walks.catalog, walks.store, before.id).values())
-    started = switch(walks, extractor="gsv:walks")
-    result = done(walks, started)
-    assert (result["dimension"], result["photos"], result["failed"]) == (128, PHOTOS, 0)
-    assert walks.json("GET", "/maps/default")["extractor"] == "gsv:walks"
-    walks.indexed(PHOTOS)
-    assert active(walks).extractor == "gsv:walks"
-
-    assert done(walks, switch(walks, extractor=before.extractor))["photos"] == PHOTOS + 1
-    again = active(walks)
-    assert (again.extractor, again.spec) == (before.extractor, before.spec)
-    rows = list(stored_rows(walks.catalog, walks.store, again.id).values())
-    for old in old_rows:
-        assert any(same(old, row) for row in rows)
 
 
 def test_a_map_that_has_no_photo_yet_takes_the_model_at_once(walks: Service) -> None:
@@ -367,7 +339,11 @@ def test_a_file_that_is_not_what_was_stored_describes_nothing(walks: Service) ->
 # --- removing --------------------------------------------------------------------------------
 
 
-def test_a_model_that_describes_a_map_stays(walks: Service) -> None:
+def test_a_model_that_describes_a_map_or_new_ones_stays(walks: Service) -> None:
+    settings = walks.settings.model_copy(update={"extractor": "gsv:walks"})
+    other = Service(walks.catalog, walks.store, settings, walks.make_worker)
+    body = problem(other("DELETE", "/models/walks"), 409, "model_in_use")
+    assert "EXTRACTOR" in body["detail"]
     walks.json("POST", "/maps", 201, json={"name": "empty", "extractor": "gsv:walks"})
     assert problem(walks("DELETE", "/models/walks"), 409, "model_in_use")["maps"] == ["empty"]
     walks.json("DELETE", "/maps/empty")
@@ -392,14 +368,6 @@ def test_a_removed_model_goes_with_its_bytes_and_its_name_means_no_other(walks: 
     assert "names are not reused" in reason
     assert not done(walks, send(walks, some_checkpoint()))["already_there"]
     assert done(walks, switch(walks, extractor="gsv:walks"))["dimension"] == 128
-
-
-def test_the_model_of_new_maps_stays(service: Service) -> None:
-    done(service, send(service, some_checkpoint()))
-    settings = service.settings.model_copy(update={"extractor": "gsv:walks"})
-    other = Service(service.catalog, service.store, settings, service.make_worker)
-    body = problem(other("DELETE", "/models/walks"), 409, "model_in_use")
-    assert "EXTRACTOR" in body["detail"]
 
 
 def test_a_model_that_is_removed_at_the_last_moment_begins_no_generation(

@@ -68,9 +68,9 @@ def test_each_photo_gets_its_one_row_and_the_right_one(averages: Workplace) -> N
     assert averages.drain().claimed == 0
 
 
-def test_a_query_leaves_its_row_beside_its_bytes_and_none_in_the_map(averages: Workplace) -> None:
-    averages.upload(1)
-    averages.drain()
+def test_a_query_in_an_empty_map_leaves_its_row_beside_its_bytes_and_none_in_the_map(
+    averages: Workplace,
+) -> None:
     data = photo_bytes(2)
     job_id = averages.ask(data)
     assert averages.drain().succeeded == 1
@@ -83,14 +83,8 @@ def test_a_query_leaves_its_row_beside_its_bytes_and_none_in_the_map(averages: W
     rows = decode_rows(averages.store.get(query_vector_key(job_id)))
     assert rows.shape == (1, 16)
     assert same(rows[0], expected_row("test-tiny-avg", data))
-    assert len(averages.rows()) == 1
-
-
-def test_a_query_comes_first_in_an_empty_map(averages: Workplace) -> None:
-    job_id = averages.ask(photo_bytes(2))
-    averages.drain()
-    assert averages.job(job_id).state == JobState.SUCCEEDED
     assert averages.active().dimension == 16
+    assert averages.rows() == {}
 
 
 def test_a_photo_that_is_at_fault_fails_alone(averages: Workplace) -> None:
@@ -192,27 +186,7 @@ def test_vocabulary_is_fitted_on_photos_of_different_sizes(
     assert len(place.rows()) == 3
 
 
-def test_a_query_waits_for_one_batch_at_most(averages: Workplace, before_describing: Hook) -> None:
-    averages.upload(0)
-    averages.drain()
-    photo_ids = averages.upload(*range(1, 17))  # four batches
-    queries: list[UUID] = []
-    done_before: list[tuple[int, JobState]] = []
-
-    def watch(pixels: list[Pixels]) -> None:
-        if queries:
-            done_before.append((len(pixels), JobState(averages.job(queries[0]).state)))
-        else:  # in the first batch, when the second one is claimed and decoded already
-            queries.append(averages.ask(photo_bytes(99)))
-
-    before_describing(watch)
-    averages.drain()
-    assert done_before[0] == (1, JobState.RUNNING)  # the next forward pass is the query's
-    assert done_before[1:] == [(4, JobState.SUCCEEDED)] * 3
-    assert len(averages.rows()) == len(photo_ids) + 1
-
-
-def test_a_query_does_not_even_wait_for_the_batch_that_is_being_described(
+def test_a_query_does_not_wait_for_the_batch_that_is_being_described(
     averages: Workplace, before_describing: Hook
 ) -> None:
     averages.upload(0)
@@ -312,40 +286,29 @@ def test_photos_wait_for_a_vocabulary_which_is_fitted_once_there_are_enough(
 
 
 @pytest.mark.usefixtures("fit_at_four_photos")
-def test_a_vocabulary_is_fitted_again_when_the_map_has_doubled(vlads: Workplace) -> None:
-    vlads.upload(*range(5))
-    vlads.drain()
-    (first,) = vlads.fit_if_due()
-    vlads.finish(first)
-    vlads.upload(*range(5, 9))
-    vlads.drain()
-    assert vlads.fit_if_due() == [first]
-    vlads.upload(9)
-    vlads.drain()
-    _, second = vlads.fit_if_due()
-    assert vlads.finish(second).state == JobState.SUCCEEDED
-    assert vlads.fit_if_due() == [first, second]
-    assert vlads.searchable() == 10
-
-
-@pytest.mark.usefixtures("fit_at_four_photos")
-@pytest.mark.parametrize("end", ["failed", "cancelled"])
-def test_after_a_fit_that_did_not_succeed_the_next_one_waits_until_the_map_has_doubled(
-    vlads: Workplace, end: str
+def test_a_vocabulary_is_fitted_again_when_the_map_has_doubled_also_after_a_cancelled_fit(
+    vlads: Workplace,
 ) -> None:
     vlads.upload(*range(4))
     vlads.drain()
     (first,) = vlads.fit_if_due()
-    if end == "failed":
-        set_columns(vlads.catalog, first, state=JobState.FAILED)
-    else:
-        vlads.cancel(first)
+    vlads.cancel(first)
     vlads.upload(*range(4, 7))
     vlads.drain()
     assert vlads.fit_if_due() == [first]
     vlads.upload(7)
     vlads.drain()
-    assert len(vlads.fit_if_due()) == 2
+    _, second = vlads.fit_if_due()
+    assert vlads.finish(second).state == JobState.SUCCEEDED
+    vlads.upload(*range(8, 15))
+    vlads.drain()
+    assert vlads.fit_if_due() == [first, second]
+    vlads.upload(15)
+    vlads.drain()
+    *_, third = vlads.fit_if_due()
+    assert vlads.finish(third).state == JobState.SUCCEEDED
+    assert vlads.fit_if_due() == [first, second, third]
+    assert vlads.searchable() == 16
 
 
 @pytest.mark.usefixtures("fit_at_four_photos")

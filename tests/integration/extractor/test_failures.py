@@ -130,19 +130,6 @@ def _age(store: FolderStore, key: str, seconds: float) -> None:
     os.utime(store.path(key), (then, then))
 
 
-def test_a_stopping_worker_gives_back_what_it_took_ahead(
-    averages: Workplace, before_describing: Hook
-) -> None:
-    stop = threading.Event()
-    before_describing(lambda _: stop.set())
-    photo_ids = averages.upload(*range(8))
-    result = averages.worker.drain(stop)
-    assert (result.claimed, result.succeeded) == (8, 4)
-    ahead = [averages.job_of(photo_id) for photo_id in photo_ids[4:]]
-    assert all(job.state == JobState.QUEUED and job.lease_token is None for job in ahead)
-    assert all(job.attempts == 0 and not job.alone for job in ahead)
-
-
 def test_no_lease_is_held_on_when_the_catalog_went_away_in_a_drain(
     averages: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:

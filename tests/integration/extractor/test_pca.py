@@ -15,11 +15,8 @@ from services.extractor import describe, fits
 from services.extractor.generation_resolver import reindex_outdated_generations
 from services.extractor.model_registry import ModelRegistry
 from services.steward.tasks import model_changes
-from services.steward.tasks.delete_maps import purge_deleted_maps
 from services.steward.tasks.garbage_collection import collect_whitenings
 from services.steward.tasks.orphans import collect_orphans
-from shared.catalog.generations import Generation
-from shared.catalog.maps import Map, mark_map_deleted
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.vocabularies import StoredWhitening
 from shared.descriptors import extractor as extractor_module
@@ -330,13 +327,3 @@ def test_a_whitening_goes_when_its_generations_have_ended(reduced: Workplace) ->
     assert (reduced.keys(WHITENINGS), whitenings(reduced)) == (set(), [])
     history = reduced.generation(ended)
     assert (history.whitening_id, history.pca_from) == (None, 16)
-
-
-def test_a_deleted_map_leaves_no_whitening(reduced: Workplace) -> None:
-    with reduced.catalog.write() as session:
-        mark_map_deleted(session, session.get_one(Map, reduced.map_id))
-    purge_deleted_maps(reduced.catalog, reduced.store)
-    assert whitenings(reduced) == []
-    assert reduced.keys(WHITENINGS) == set()
-    with reduced.catalog.read() as session:
-        assert session.query(Generation).count() == 0

@@ -146,7 +146,9 @@ def test_photo_that_is_tried_alone_begins_when_nothing_else_is_under_way(
     assert gate.seen == ["describe 4", "published 4", "describe 1", "published 1"]
 
 
-def test_stopping_worker_publishes_what_it_has_described(averages: Workplace, gate: Gate) -> None:
+def test_stopping_worker_publishes_what_it_has_described_and_gives_back_the_rest(
+    averages: Workplace, gate: Gate
+) -> None:
     photo_ids = averages.upload(*range(3 * BATCH))
     stop = threading.Event()
     draining, results = in_thread(lambda: averages.worker.drain(stop))
@@ -159,6 +161,7 @@ def test_stopping_worker_publishes_what_it_has_described(averages: Workplace, ga
     assert set(averages.rows()) == set(photo_ids[:8])
     left = [averages.job_of(photo_id) for photo_id in photo_ids[8:]]
     assert all(job.state == JobState.QUEUED and job.lease_token is None for job in left)
+    assert all(job.attempts == 0 and not job.alone for job in left)
 
 
 def test_batch_whose_publishing_crashes_is_tried_alone_and_the_next_one_is_not_to_blame(

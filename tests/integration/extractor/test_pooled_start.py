@@ -16,10 +16,8 @@ from shared.catalog.jobs import UNFINISHED_STATES, WaitingFor
 from shared.catalog.maps import Map
 from shared.catalog.vocabularies import vocabulary_standing
 from shared.config.settings import Settings
-from shared.descriptors.vocabulary import encode_centres, parse_centres
 from shared.jobs import Job, JobKind, JobState
-from shared.storage import FolderStore
-from shared.storage.keys import new_vocabulary_key
+from tests.integration.extractor.model_changes import import_file, npy, some_centres
 from tests.integration.in_process_api import Service
 from tests.integration.workplace import Workplace, expected_row, same
 from tests.support.catalog_rows import set_columns
@@ -31,13 +29,6 @@ pytestmark = pytest.mark.databases("postgresql")
 
 VLAD = "test-tiny-vlad"
 POOLED = "test-tiny-vlad:aggregator=gem"
-
-
-@pytest.fixture
-def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    path = tmp_path / "dinov2_vits14_pretrain.pth"
-    monkeypatch.setenv("DINO_WEIGHTS", str(path))
-    return path
 
 
 @pytest.fixture
@@ -101,11 +92,8 @@ def test_with_enough_photos_a_vocabulary_is_fitted_while_the_pooled_descriptors_
     assert len(pooled.rows()[photo_ids[0]]) == 16 * pooled.active().spec["clusters"]
 
 
-def test_an_imported_vocabulary_ends_the_pooling(pooled: Workplace, store: FolderStore) -> None:
-    centres = parse_centres(expected_row("test-tiny-avg", photo_bytes(1))[None])
-    key = new_vocabulary_key()
-    store.put(key, encode_centres(centres))
-    job = pooled.start(JobKind.IMPORT, object_key=key, filename="centres.npy")
+def test_an_imported_vocabulary_ends_the_pooling(pooled: Workplace) -> None:
+    job = import_file(pooled, npy(some_centres(1)))
     assert pooled.finish(job).state == JobState.SUCCEEDED
     assert extractors(pooled) == (VLAD, VLAD, "foreign")
 

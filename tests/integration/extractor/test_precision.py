@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from services.extractor.generation_resolver import reindex_outdated_generations
-from services.extractor.model_registry import ModelRegistry
 from services.extractor.worker import ExtractorWorker
 from shared.catalog.generations import Generation
 from shared.descriptors.extractor import Extractor
@@ -38,13 +37,14 @@ def precision_of(generation: Generation) -> str:
     return found
 
 
-def test_photos_join_a_generation_in_the_precision_that_it_was_begun_in(
+def test_another_setting_describes_nothing_anew_and_photos_join_in_the_generations_precision(
     averages: Workplace, make_worker: Callable[..., ExtractorWorker]
 ) -> None:
     assert not same(row("float32", 2), row("bfloat16", 2)), "else this test could not fail"
     first = averages.upload(1)
     averages.drain()
     averages._worker = make_worker(precision="bfloat16")
+    assert reindex_outdated_generations(averages.catalog, averages.worker.context.models) == 0
     second = averages.upload(2)
     query = averages.ask(photo_bytes(3))
     averages.drain()
@@ -62,11 +62,7 @@ def test_setting_decides_for_a_map_that_begins(
     (photo_id,) = averages.upload(2)
     averages.drain()
     assert precision_of(averages.active()) == "bfloat16"
-    averages._worker = make_worker(precision="auto")  # another machine of the fleet, without a GPU
-    (other,) = averages.upload(3)
-    averages.drain()
     assert same(averages.rows()[photo_id], row("bfloat16", 2))
-    assert same(averages.rows()[other], row("bfloat16", 3))
 
 
 def test_model_change_brings_the_other_precision_to_all_photos(
@@ -95,15 +91,6 @@ def test_pca_keeps_the_precision_of_the_rows_that_it_shortens(
     shortened = averages.active().spec
     assert (shortened["dimension"], shortened["precision"]) == (2, "float32")
     assert shortened.keys() - whole.keys() == {"whitening"}
-
-
-def test_another_setting_alone_describes_nothing_anew(
-    averages: Workplace, make_worker: Callable[..., ExtractorWorker]
-) -> None:
-    averages.upload(1)
-    averages.drain()
-    models: ModelRegistry = make_worker(precision="bfloat16").context.models
-    assert reindex_outdated_generations(averages.catalog, models) == 0
 
 
 def test_photos_wait_where_the_generations_precision_is_not_known(averages: Workplace) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any
-from uuid import UUID
 
 import numpy as np
 import pytest
@@ -16,14 +15,12 @@ from shared.descriptors.vocabulary_file import Provenance, VocabularyFile, featu
 from shared.extractor_config.configs import get_extractor_config
 from shared.imaging import preprocessing
 from shared.jobs import JobKind, JobState
-from shared.storage.keys import new_vocabulary_key
-from tests.integration.workplace import FIT, Workplace
+from tests.integration.extractor.model_changes import WIDTH, import_file
+from tests.integration.workplace import Workplace
 from tests.support.catalog_rows import failure_code, problem_of
 
 # tests/e2e/test_vocabulary_command.py exports and imports vocabularies on SQLite.
 pytestmark = pytest.mark.databases("postgresql")
-
-WIDTH = 16  # of the tiny backbone's local features
 
 
 def tiny_features() -> Provenance:
@@ -36,12 +33,6 @@ def vocabulary_file(**provenance: Any) -> bytes:
     centres = parse_centres(np.random.default_rng(3).standard_normal((5, WIDTH)).astype(np.float32))
     fields = {**tiny_features(), "photos": 40, "sha256": centres.sha256, **provenance}
     return VocabularyFile(centres, fields).encode()
-
-
-def import_file(workplace: Workplace, data: bytes, name: str) -> UUID:
-    key = new_vocabulary_key()
-    workplace.store.put(key, data)
-    return workplace.start(JobKind.IMPORT, object_key=key, filename=name)
 
 
 def active_vocabulary(workplace: Workplace) -> Vocabulary:
@@ -83,44 +74,6 @@ def test_an_imported_vocabulary_keeps_what_its_file_says(vlads: Workplace) -> No
         "imported_from": "turin.npz",
     }
     assert decode_centres(vlads.store.get(found.object_key)).sha256 == found.sha256
-
-
-def test_a_file_of_bare_centres_is_marked_as_of_unknown_origin(vlads: Workplace) -> None:
-    vlads.upload(1)
-    centres = parse_centres(np.eye(3, WIDTH, dtype=np.float32))
-    job = vlads.finish(import_file(vlads, encode_centres(centres), "c_centers.npy"))
-    assert job.state == JobState.SUCCEEDED
-    assert active_vocabulary(vlads).provenance == {
-        "learnt_with": "unknown",
-        "imported_from": "c_centers.npy",
-    }
-
-
-def test_a_vocabulary_of_other_weights_is_refused_with_both_specs(vlads: Workplace) -> None:
-    vlads.upload(*range(6))
-    assert vlads.fit().state == JobState.SUCCEEDED
-    before = vlads.active().id
-    other = vocabulary_file(backbone="dinov2-vits14", backbone_fingerprint="cd" * 32, layer="10")
-    job = vlads.finish(import_file(vlads, other, "vits14.npz"))
-    assert failure_code(job) == "vocabulary_unusable"
-    assert "dinov2-vits14 (weights cdcdcdcdcdcd), layer 10" in problem_of(job)["detail"]
-    assert "test-tiny-vlad computes test-tiny (weights" in problem_of(job)["detail"]
-    assert problem_of(job)["learnt_with"]["backbone"] == "dinov2-vits14"
-    assert problem_of(job)["extractor_makes"] == tiny_features()
-    assert vlads.active().id == before
-
-
-def test_a_switch_to_a_vocabulary_of_former_weights_is_refused(vlads: Workplace) -> None:
-    vlads.upload(*range(6))
-    assert vlads.fit().state == JobState.SUCCEEDED
-    first = vlads.active().vocabulary_id
-    assert vlads.fit(**{**FIT, "seed": 1}).state == JobState.SUCCEEDED
-    with vlads.catalog.write() as session:
-        retained = session.get_one(Vocabulary, first)
-        retained.provenance = {**retained.provenance, "backbone_fingerprint": "ef" * 32}
-    job = vlads.finish(vlads.start(JobKind.SWITCH, vocabulary_id=str(first)))
-    assert failure_code(job) == "vocabulary_unusable"
-    assert "efefefefefef" in problem_of(job)["detail"]
 
 
 def test_after_another_version_of_the_preprocessing_only_what_may_fit_is_switched_to(
