@@ -9,13 +9,13 @@ from uuid import UUID
 
 from sqlalchemy import select, update
 
+from services.steward.tasks.compaction import merge_slot, merge_small_chunks
 from shared.catalog.chunks import Descriptor, count_searchable, list_live_chunks
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import Map
 from shared.storage import FolderStore
-from shared.storage.keys import (
-    TRASH,
-)
+from shared.storage.keys import TRASH
+from shared.storage.read_retries import ReadRetries
 from tests.integration.workplace import same
 from tests.support.catalog_rows import (
     add_chunk,
@@ -55,6 +55,13 @@ class ChunkMap:
     def delete(self, *photo_ids: UUID) -> None:
         for photo_id in photo_ids:
             delete(self.catalog, self.map_id, photo_id)
+
+    def merge(self, compact_chunks: int = MANY, retries: ReadRetries | None = None) -> int:
+        """One round of the steward's merging; how many slots it has merged."""
+        return merge_small_chunks(self.catalog, self.store, compact_chunks, retries)
+
+    def merge_slot(self) -> bool:
+        return merge_slot(self.catalog, self.store, self.generation_id, 0)
 
     def live(self) -> list[tuple[int, int]]:
         """(slot, rows) of the live chunks."""

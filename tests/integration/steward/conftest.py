@@ -8,9 +8,7 @@ import pytest
 
 from services.extractor.worker import ExtractorWorker
 from shared.catalog.database.session import Catalog
-from shared.catalog.maps import (
-    get_or_create_default_map,
-)
+from shared.catalog.maps import get_or_create_default_map
 from shared.config.settings import Settings
 from shared.storage import FolderStore, OwnedStore
 from shared.storage.s3 import S3Store

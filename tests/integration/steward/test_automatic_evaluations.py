@@ -114,8 +114,7 @@ def test_an_automatic_evaluation_is_not_for_every_map_setting_or_moment(town: To
     assert automatic(town), "someone's question changes nothing"
 
 
-@pytest.mark.parametrize("end", ["fails", "is cancelled"])
-@pytest.mark.parametrize("earlier", [False, True])
+@pytest.mark.parametrize(("earlier", "end"), [(False, "fails"), (True, "is cancelled")])
 def test_an_evaluation_that_came_to_nothing_is_not_tried_again_before_the_next_change(
     town: Town, earlier: bool, end: str
 ) -> None:

@@ -11,12 +11,10 @@ from sqlalchemy import func, select
 
 from services.steward.batches import worker as worker_module
 from services.steward.batches.worker import cancel_items_of_ended_batches
-from services.steward.tasks.delete_maps import purge_deleted_maps
-from shared.catalog.batch_items import BatchItem
 from shared.catalog.database.session import Catalog
 from shared.jobs import Job, JobKind, JobState
 from tests.integration.in_process_api import Service
-from tests.integration.steward.batches import ROUNDS, Batches, codes, counts, files, lines
+from tests.integration.steward.batches import Batches, codes, counts, files, lines
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 
@@ -62,24 +60,32 @@ def test_each_bad_object_has_its_reason_and_the_others_come_in(batches: Batches)
     assert codes(batches.items(job_id, state="failed")) == [c for c in codes(items) if c]
 
 
-def test_uploaded_files_are_refused_one_by_one_and_leave_no_bytes(batches: Batches) -> None:
+def test_uploaded_files_fail_one_by_one_and_what_is_refused_leaves_no_bytes(
+    batches: Batches,
+) -> None:
+    whole = photo_bytes(1)
+    torn = whole[: whole.index(b"\xff\xda")] + bytes(2)  # seen when it is described
     job_id = batches.start(
         ("text.jpg", b"no photo"),
         *files(1),
         ("cut.jpg", b"\xff\xd8\xff" + bytes(1000)),
         ("empty.jpg", b""),
         *files(1),
+        ("torn.jpg", torn),
     )
     job = batches.finish(job_id)
-    assert counts(job) == (2, 5, 3)
-    assert codes(batches.items(job_id)) == [
+    assert (job["state"], counts(job)) == ("succeeded", (2, 6, 4))
+    items = batches.items(job_id)
+    assert codes(items) == [
         "unsupported_photo",
         None,
         "undecodable_photo",
         "empty_file",
         None,
+        "undecodable_photo",
     ]
-    assert len(batches.keys("originals/")) == 1
+    assert items[5]["file_id"]
+    assert len(batches.keys("originals/")) == 2
 
 
 def test_items_come_in_pages(batches: Batches) -> None:
@@ -115,17 +121,6 @@ def test_the_same_bytes_with_other_metadata_are_rejected(batches: Batches) -> No
     batches.finish(job_id)
     assert codes(batches.items(job_id)) == ["photo_differs"]
     assert len(batches.keys("originals/")) == 1
-
-
-def test_a_photo_that_can_not_be_decoded_fails_its_item(batches: Batches) -> None:
-    whole = photo_bytes(1)
-    header = whole[: whole.index(b"\xff\xda")] + bytes(2)
-    job_id = batches.start(("torn.jpg", header), *files(2))
-    job = batches.finish(job_id)
-    assert (job["state"], counts(job)) == ("succeeded", (1, 2, 1))
-    [failed] = batches.items(job_id, state="failed")
-    assert failed["error"]["code"] == "undecodable_photo"
-    assert failed["file_id"]
 
 
 def queued_photos(catalog: Catalog) -> int:
@@ -249,18 +244,6 @@ def test_a_photo_that_is_deleted_meanwhile_ends_its_item(batches: Batches) -> No
     job = batches.finish(job_id)
     assert (job["state"], batches.states(job_id)) == ("succeeded", ["cancelled", "succeeded"])
     assert counts(job) == (1, 2, 0)
-
-
-def test_a_map_that_is_deleted_takes_its_batch_along(batches: Batches) -> None:
-    batches.start(*files(*range(6)))
-    batches.start(*files(7, 8))
-    batches.work(batches.new_worker(batch_ahead_photos=3))
-    batches.service.json("DELETE", "/maps/default")
-    for _ in range(ROUNDS):
-        purge_deleted_maps(batches.catalog, batches.store)
-    assert batches.keys("originals/") == set()
-    with batches.catalog.read() as session:
-        assert session.scalar(select(func.count()).select_from(BatchItem)) == 0
 
 
 def test_a_batch_waits_with_its_photos_for_a_vocabulary(batches: Batches, service: Service) -> None:

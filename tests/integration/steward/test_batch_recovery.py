@@ -196,12 +196,11 @@ def test_a_forgotten_batch_takes_its_items_along(batches: Batches) -> None:
         assert session.scalar(select(func.count()).select_from(Photo)) == 1
 
 
-@pytest.mark.parametrize("source", ["files", "keys"])
-def test_every_source_is_brought_in_on_a_bucket_across_a_kill(
-    on_s3: Batches, monkeypatch: pytest.MonkeyPatch, source: str
+def test_objects_of_a_bucket_are_brought_in_across_a_kill(
+    on_s3: Batches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photos = files(*range(5))
-    job_id = on_s3.start(*photos) if source == "files" else on_s3.start_import(photos)
+    job_id = on_s3.start_import(photos)
     real = validation.validate_photo
     left = [3]
 

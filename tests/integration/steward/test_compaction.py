@@ -12,59 +12,48 @@ from uuid import UUID
 import pytest
 
 from services.steward.tasks import compaction
-from services.steward.tasks.compaction import merge_slot, merge_small_chunks
-from services.steward.tasks.garbage_collection import (
-    collect_deleted_photos,
-)
+from services.steward.tasks.garbage_collection import collect_deleted_photos
 from shared.catalog.chunks import Descriptor, count_searchable, list_live_chunks
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.photos import Photo
 from shared.storage.chunks import WrittenChunk, read_chunk, write_chunk
 from shared.storage.read_retries import ReadRetries
-from tests.integration.steward.chunk_map import HOUR_SECONDS, MANY, ChunkMap
+from tests.integration.steward.chunk_map import HOUR_SECONDS, ChunkMap
 from tests.integration.workplace import same
-from tests.support.catalog_rows import (
-    row_of,
-    stored_rows,
-)
+from tests.support.catalog_rows import row_of, stored_rows
 
 # tests/faults/test_kills.py merges chunks on SQLite.
 pytestmark = pytest.mark.databases("postgresql")
 
 
-def test_small_chunks_of_a_slot_become_one(chunk_map: ChunkMap) -> None:
-    photo_ids = sum_of(chunk_map.chunks(2, 3, 1))
+def test_small_chunks_of_an_open_slot_become_one_once_there_are_enough(chunk_map: ChunkMap) -> None:
+    photo_ids = sum_of(chunk_map.chunks(2, 3))
+    assert chunk_map.merge(3) == 0
+    assert chunk_map.live() == [(0, 2), (0, 3)]
+    photo_ids += sum_of(chunk_map.chunks(1))
     version = chunk_map.version()
-    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, compact_chunks=3) == 1
+    assert chunk_map.merge(3) == 1
     assert chunk_map.live() == [(0, 6)]
     chunk_map.check_rows(photo_ids)
     assert chunk_map.version() == version + 1  # search workers look again
-    assert (
-        merge_small_chunks(chunk_map.catalog, chunk_map.store, compact_chunks=3) == 0
-    )  # nothing is left to do
+    assert chunk_map.merge(3) == 0  # nothing is left to do
 
 
 def sum_of(parts: list[list[UUID]]) -> list[UUID]:
     return [photo_id for part in parts for photo_id in part]
 
 
-def test_few_chunks_of_an_open_slot_are_left(chunk_map: ChunkMap) -> None:
-    chunk_map.chunks(2, 3)
-    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, compact_chunks=3) == 0
-    assert chunk_map.live() == [(0, 2), (0, 3)]
-
-
 def test_merging_stays_inside_a_slot_and_never_exceeds_its_rows(chunk_map: ChunkMap) -> None:
     photo_ids = sum_of(chunk_map.chunks(3, 4, 3, 5, 5, 9, 1, slot_rows=10))
     assert chunk_map.live() == [(0, 3), (0, 4), (0, 3), (1, 5), (1, 5), (2, 9), (2, 1)]
     # The full slots alone: the open one (2) is no worse than it may be.
-    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, MANY) == 2
+    assert chunk_map.merge() == 2
     assert chunk_map.live() == [(0, 10), (1, 10), (2, 9), (2, 1)]
     with chunk_map.catalog.read() as session:
         sealed = [chunk.sealed for chunk in list_live_chunks(session, chunk_map.generation_id)]
     assert sealed == [True, True, False, False]
-    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, compact_chunks=2) == 1
+    assert chunk_map.merge(2) == 1
     assert chunk_map.live() == [(0, 10), (1, 10), (2, 10)]
     chunk_map.check_rows(photo_ids)
 
@@ -82,7 +71,7 @@ def test_a_row_of_a_full_slot_was_merged_at_most_twice(
     photo_ids = []
     for _ in range(24):
         photo_ids += sum_of(chunk_map.chunks(2, slot_rows=16))
-        merge_small_chunks(chunk_map.catalog, chunk_map.store, compact_chunks=2)
+        chunk_map.merge(2)
         assert len(chunk_map.live()) <= 3 + 4
     assert set(written.values()) <= {1, 2}
     chunk_map.check_rows(photo_ids)
@@ -92,7 +81,7 @@ def test_an_open_slot_of_small_batches_has_a_bounded_number_of_chunks(chunk_map:
     photo_ids = []
     for _ in range(40):
         photo_ids += sum_of(chunk_map.chunks(1))
-        merge_small_chunks(chunk_map.catalog, chunk_map.store, compact_chunks=2)
+        chunk_map.merge(2)
         assert len(chunk_map.live()) < 4 * 2 + 2
     chunk_map.check_rows(photo_ids)
 
@@ -100,11 +89,9 @@ def test_an_open_slot_of_small_batches_has_a_bounded_number_of_chunks(chunk_map:
 def test_rows_of_deleted_photos_are_dropped(chunk_map: ChunkMap) -> None:
     first, second = chunk_map.chunks(5, 5)
     chunk_map.delete(first[0], first[4])
-    assert (
-        merge_small_chunks(chunk_map.catalog, chunk_map.store, MANY) == 0
-    )  # a fifth is not worth it
+    assert chunk_map.merge() == 0  # a fifth is not worth it
     chunk_map.delete(second[2])
-    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, MANY) == 1
+    assert chunk_map.merge() == 1
     assert chunk_map.live() == [(0, 7)]
     chunk_map.check_rows([*first[1:4], *second[:2], *second[3:]])
 
@@ -112,10 +99,10 @@ def test_rows_of_deleted_photos_are_dropped(chunk_map: ChunkMap) -> None:
 def test_a_slot_of_deleted_photos_is_left_without_a_chunk(chunk_map: ChunkMap) -> None:
     (photo_ids,) = chunk_map.chunks(3)
     chunk_map.delete(*photo_ids)
-    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, MANY) == 1
+    assert chunk_map.merge() == 1
     assert chunk_map.live() == []
     chunk_map.check_rows([])
-    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, MANY) == 0
+    assert chunk_map.merge() == 0
 
 
 def test_rows_that_no_photo_ever_had_are_dropped(chunk_map: ChunkMap) -> None:
@@ -123,7 +110,7 @@ def test_rows_that_no_photo_ever_had_are_dropped(chunk_map: ChunkMap) -> None:
     with chunk_map.catalog.write() as session:  # two jobs of the batch were taken over
         for photo_id in photo_ids[:2]:
             session.delete(session.get_one(Descriptor, (chunk_map.generation_id, photo_id)))
-    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, MANY) == 1
+    assert chunk_map.merge() == 1
     assert chunk_map.live() == [(0, 2)]
     chunk_map.check_rows(photo_ids[2:])
 
@@ -143,10 +130,7 @@ def test_merging_twice_at_once_merges_once(
         first_keys = {list_live_chunks(session, chunk_map.generation_id)[0].object_key}
     monkeypatch.setattr(compaction, "read_chunk", read_together)
     with ThreadPoolExecutor(2) as pool:
-        merges = [
-            pool.submit(merge_slot, chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
-            for _ in range(2)
-        ]
+        merges = [pool.submit(chunk_map.merge_slot) for _ in range(2)]
         assert sorted(merge.result() for merge in merges) == [False, True]
     assert chunk_map.live() == [(0, 5)]
     chunk_map.check_rows(photo_ids)
@@ -179,12 +163,12 @@ def test_a_photo_deleted_while_merging_does_not_come_back(
 ) -> None:
     first, second = chunk_map.chunks(2, 3)
     while_merging(lambda: chunk_map.delete(first[0]))
-    assert merge_slot(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
+    assert chunk_map.merge_slot()
     with chunk_map.catalog.read() as session:
         assert count_searchable(session, chunk_map.generation_id) == 4
     rows = stored_rows(chunk_map.catalog, chunk_map.store, chunk_map.generation_id)
     assert all(same(row, row_of(photo_id)) for photo_id, row in rows.items())
-    assert merge_slot(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
+    assert chunk_map.merge_slot()
     chunk_map.check_rows([first[1], *second])
 
 
@@ -199,7 +183,7 @@ def test_a_photo_forgotten_while_merging_does_not_come_back(
         collect_deleted_photos(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
 
     while_merging(forget)
-    assert merge_slot(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
+    assert chunk_map.merge_slot()
     assert chunk_map.live() == [(0, 5)]  # its row is dead
     chunk_map.check_rows([first[1], *second])
 
@@ -210,7 +194,7 @@ def test_a_chunk_that_arrives_while_merging_is_not_lost(
     first, second = chunk_map.chunks(2, 3)
     late: list[UUID] = []
     while_merging(lambda: late.extend(sum_of(chunk_map.chunks(2))))
-    assert merge_slot(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
+    assert chunk_map.merge_slot()
     assert chunk_map.live() == [(0, 5), (0, 2)]
     chunk_map.check_rows([*first, *second, *late])
 
@@ -221,7 +205,7 @@ def test_a_corrupt_chunk_stays_and_others_are_merged(chunk_map: ChunkMap) -> Non
         broken = list_live_chunks(session, chunk_map.generation_id)[0].object_key
     whole = chunk_map.store.get(broken)
     chunk_map.store.put(broken, whole[:-1] + bytes([whole[-1] ^ 1]))
-    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, compact_chunks=2) == 1
+    assert chunk_map.merge(2) == 1
     assert chunk_map.live() == [(0, 5), (0, 5), (1, 6)]
     chunk_map.store.put(broken, whole)
     chunk_map.check_rows(photo_ids)
@@ -236,16 +220,14 @@ def test_a_corrupt_chunk_is_not_read_with_every_round_of_merging(
     whole = chunk_map.store.get(broken)
     chunk_map.store.put(broken, whole[:-1])
     retries = ReadRetries()
-    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, 2, retries) == 0
+    assert chunk_map.merge(2, retries) == 0
     chunk_map.store.put(broken, whole)
-    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, 2, retries) == 0, (
-        "its pause is not over"
-    )
+    assert chunk_map.merge(2, retries) == 0, "its pause is not over"
     monkeypatch.setattr("shared.storage.read_retries.time.monotonic", lambda: float("inf"))
-    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, 2, retries) == 1
+    assert chunk_map.merge(2, retries) == 1
 
 
 def test_generations_that_no_longer_answer_are_not_merged(chunk_map: ChunkMap) -> None:
     chunk_map.chunks(1, 1, 1)
     chunk_map.change(Generation, chunk_map.generation_id, state=GenerationState.RETIRED)
-    assert merge_small_chunks(chunk_map.catalog, chunk_map.store, compact_chunks=2) == 0
+    assert chunk_map.merge(2) == 0

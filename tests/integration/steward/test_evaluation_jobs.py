@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from typing import Any
+from uuid import UUID
 
 import pytest
 
@@ -11,20 +11,14 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Evaluation
 from shared.catalog.jobs import get_job
 from shared.catalog.maps import Search, get_map
-from shared.errors import Unavailable
 from shared.jobs import JobState, progress, reclaim_expired_leases
 from shared.jobs.transitions import cancel_job, retry_job
 from shared.storage import read_retries
 from tests.integration.in_process_api import Service
+from tests.integration.steward.batches import Killed
 from tests.integration.steward.streets import STREETS, WITHOUT_PLACE
 from tests.integration.town import Town, Watched
-from tests.support.catalog_rows import (
-    add_generation,
-    end_pauses,
-    expire_lease,
-    failure_code,
-    read_job,
-)
+from tests.support.catalog_rows import add_generation, expire_lease, failure_code, read_job
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 
@@ -38,16 +32,17 @@ def look_always(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress, "PROGRESS_SECONDS", 0.0)
 
 
+def cancel(town: Town, job_id: UUID) -> None:
+    with town.catalog.write() as session:
+        cancel_job(get_job(session, town.map_id, job_id, lock=True))
+
+
 @pytest.mark.usefixtures("look_always")
 def test_a_cancelled_evaluation_ends_soon_and_leaves_nothing(town: Town) -> None:
     town.publish(STREETS)
     job_id = town.start()
 
-    def cancel_it() -> None:
-        with town.catalog.write() as session:
-            cancel_job(get_job(session, town.map_id, job_id, lock=True))
-
-    search = Watched(town.search, 2, cancel_it)
+    search = Watched(town.search, 2, lambda: cancel(town, job_id))
     assert town.work(search)
     assert search.searches <= 3
     assert read_job(town.catalog, job_id).state == JobState.CANCELLED
@@ -60,11 +55,7 @@ def test_an_evaluation_cancelled_at_the_last_moment_leaves_nothing(town: Town) -
     town.publish(STREETS)
     job_id = town.start()
 
-    def cancel_it() -> None:
-        with town.catalog.write() as session:
-            cancel_job(get_job(session, town.map_id, job_id, lock=True))
-
-    town.work(Watched(town.search, len(STREETS), cancel_it))
+    town.work(Watched(town.search, len(STREETS), lambda: cancel(town, job_id)))
     assert read_job(town.catalog, job_id).state == JobState.CANCELLED
     assert (town.evaluations(), town.calibration()) == ([], None)
     with town.catalog.write() as session:
@@ -85,10 +76,6 @@ def test_a_stopping_steward_gives_its_evaluation_to_the_next_one(town: Town) -> 
     assert town.evaluations() == []
     assert town.work()
     assert read_job(town.catalog, job_id).state == JobState.SUCCEEDED
-
-
-class Killed(BaseException):
-    pass
 
 
 def kill() -> None:
@@ -127,38 +114,6 @@ def test_an_evaluator_whose_lease_was_taken_over_commits_nothing(town: Town) -> 
     assert town.work(Watched(town.search, 3, take_over))
     assert len(town.evaluations()) == 1
     assert read_job(town.catalog, job_id).state == JobState.SUCCEEDED
-
-
-def test_an_evaluation_waits_while_search_is_away(town: Town) -> None:
-    town.publish(STREETS)
-    job_id = town.start()
-
-    def away() -> None:
-        raise Unavailable("search_behind", "Search has not caught up.")
-
-    assert town.work(Watched(town.search, 3, away))
-    job = read_job(town.catalog, job_id)
-    assert (job.state, job.attempts) == (JobState.QUEUED, 0)
-    assert job.run_after is not None
-    assert not town.work(), "it pauses"
-    end_pauses(town.catalog)
-    assert town.work()
-    assert read_job(town.catalog, job_id).state == JobState.SUCCEEDED
-
-
-def test_an_evaluation_that_crashes_is_tried_again_and_fails_in_the_end(town: Town) -> None:
-    town.publish(STREETS)
-    job_id = town.start()
-
-    def crash() -> None:
-        raise ZeroDivisionError
-
-    for _ in range(3):
-        assert town.work(Watched(town.search, 1, crash))
-    job = read_job(town.catalog, job_id)
-    assert (job.state, job.attempts) == (JobState.FAILED, 3)
-    assert job.error is not None
-    assert "ZeroDivisionError" in job.error["detail"]
 
 
 @pytest.mark.parametrize("order", [0, 1])
@@ -205,22 +160,9 @@ def test_there_must_be_something_to_evaluate(service: Service) -> None:
     assert (read["kind"], read["state"]) == ("evaluate", "queued")
 
 
-@pytest.mark.parametrize(
-    ("params", "field"),
-    [
-        ({"sample": 0}, "sample"),
-        ({"sample": 1_000_001}, "sample"),
-        ({"sample": 1.5}, "sample"),
-        ({"sample": "many"}, "sample"),
-        ({"seed": -1}, "seed"),
-        ({"seed": 2**31}, "seed"),
-        ({"radius": 5}, "radius"),
-    ],
-)
-def test_bad_numbers_are_refused_by_name(
-    service: Service, params: dict[str, Any], field: str
-) -> None:
-    field_refused(service("POST", "/evaluations", json=params), field)
+@pytest.mark.parametrize("params", [{"sample": 0}, {"seed": -1}, {"radius": 5}])
+def test_bad_fields_are_refused_by_name(service: Service, params: dict[str, int]) -> None:
+    field_refused(service("POST", "/evaluations", json=params), *params)
 
 
 @pytest.mark.parametrize("path", ["evaluations", "searches"])

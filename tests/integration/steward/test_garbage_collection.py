@@ -9,7 +9,6 @@ from uuid import UUID
 import pytest
 from sqlalchemy import func, select, update
 
-from services.steward.tasks.compaction import merge_slot
 from services.steward.tasks.garbage_collection import (
     collect_deleted_photos,
     collect_ended_generations,
@@ -33,20 +32,13 @@ from shared.storage.keys import (
 from shared.storage.protocol import ObjectInfo
 from tests.integration.steward.chunk_map import HOUR_SECONDS, ChunkMap
 from tests.integration.steward.test_compaction import sum_of
-from tests.support.catalog_rows import (
-    add_chunk,
-    add_generation,
-    add_job,
-    ask,
-    stored_rows,
-    upload,
-)
+from tests.support.catalog_rows import add_chunk, add_generation, add_job, ask, stored_rows, upload
 
 
 def test_superseded_chunks_go_after_the_grace_and_not_before(chunk_map: ChunkMap) -> None:
     photo_ids = sum_of(chunk_map.chunks(2, 3))
     old = chunk_map.objects("chunks/")
-    merge_slot(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
+    chunk_map.merge_slot()
     collect_superseded_chunks(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
     assert old < chunk_map.objects("chunks/")
     with chunk_map.catalog.write() as session:

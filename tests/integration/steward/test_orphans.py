@@ -37,12 +37,18 @@ from shared.storage.keys import (
 )
 from shared.storage.trash import Hold, HoldReason, TrashSize, read_hold, restore_trash, write_hold
 from tests.integration.steward.chunk_map import DAY_SECONDS, ChunkMap
-from tests.support.catalog_rows import (
-    add_chunk,
-    add_job,
-    ask,
-    upload,
-)
+from tests.support.catalog_rows import add_chunk, add_job, ask, upload
+
+
+def put_orphans(chunk_map: ChunkMap, *keys: str) -> None:
+    """Store bytes under these keys that no row refers to, as of two days ago."""
+    for key in keys:
+        chunk_map.store.put(key, b"orphan")
+    chunk_map.age(set(keys), 2 * DAY_SECONDS)
+
+
+def collect(chunk_map: ChunkMap, *, confirmed: bool = False) -> int:
+    return collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS, confirmed=confirmed)
 
 
 def test_old_orphans_of_every_prefix_go_and_what_is_referred_to_stays(chunk_map: ChunkMap) -> None:
@@ -62,12 +68,12 @@ def test_old_orphans_of_every_prefix_go_and_what_is_referred_to_stays(chunk_map:
         chunk_map.store.put(key, b"orphan")
     assert chunk_map.objects() == live | orphans
     chunk_map.age(live, 2 * DAY_SECONDS)
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 0  # young ones stay
+    assert collect(chunk_map) == 0  # young ones stay
     assert chunk_map.objects() == live | orphans
     chunk_map.age(orphans, DAY_SECONDS - 60)
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 0
+    assert collect(chunk_map) == 0
     chunk_map.age(orphans, DAY_SECONDS + 60)
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == len(orphans)
+    assert collect(chunk_map) == len(orphans)
     assert chunk_map.objects() == live
 
 
@@ -100,10 +106,8 @@ def _live_objects(chunk_map: ChunkMap) -> set[str]:
 def test_orphans_lie_in_the_trash_until_their_days_are_over(chunk_map: ChunkMap) -> None:
     live = _live_objects(chunk_map)
     orphans = {new_original_key(), query_key(new_id())}
-    for key in orphans:
-        chunk_map.store.put(key, b"orphan")
-    chunk_map.age(orphans, 2 * DAY_SECONDS)
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 2
+    put_orphans(chunk_map, *orphans)
+    assert collect(chunk_map) == 2
     trashed = chunk_map.objects("trash/")
     assert {key_before_trash(key) for key in trashed} == orphans
     assert empty_expired_trash(chunk_map.catalog, chunk_map.store, 7.0) == (0, TrashSize(2, 12))
@@ -118,10 +122,8 @@ def test_what_is_restored_from_the_trash_is_kept_as_long_as_a_new_orphan(
     chunk_map: ChunkMap,
 ) -> None:
     live, orphan, taken = _live_objects(chunk_map), new_original_key(), new_original_key()
-    for key in (orphan, taken):
-        chunk_map.store.put(key, b"orphan")
-    chunk_map.age({orphan, taken}, 2 * DAY_SECONDS)
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 2
+    put_orphans(chunk_map, orphan, taken)
+    assert collect(chunk_map) == 2
     chunk_map.store.put(taken, b"another one")
     restored = {
         key_before_trash(info.key): back
@@ -129,7 +131,7 @@ def test_what_is_restored_from_the_trash_is_kept_as_long_as_a_new_orphan(
     }
     assert restored == {orphan: True, taken: False}
     assert chunk_map.store.get(taken) == b"another one"
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 0
+    assert collect(chunk_map) == 0
     assert chunk_map.objects() == live | {orphan, taken}
     assert len(chunk_map.objects("trash/")) == 1
 
@@ -140,9 +142,7 @@ def test_collection_of_more_than_a_share_is_held_before_anything_is_moved(
     monkeypatch.setattr(orphans_module, "HOLD_MIN_ORPHANS", 3)
     live = _live_objects(chunk_map)
     orphans = {new_original_key() for _ in range(4)}
-    for key in orphans:
-        chunk_map.store.put(key, b"orphan")
-    chunk_map.age(orphans, 2 * DAY_SECONDS)
+    put_orphans(chunk_map, *orphans)
     metrics = StewardMetrics(CollectorRegistry())
     steward = Scheduler(chunk_map.catalog, chunk_map.store, InProcessWakeups(), settings, metrics)
     (task,) = [task for task in steward.tasks if task.name == "collect_orphans"]
@@ -158,9 +158,9 @@ def test_collection_of_more_than_a_share_is_held_before_anything_is_moved(
     assert hold is not None
     assert (hold.reason, hold.orphans, hold.orphan_bytes) == (HoldReason.SHARE, 4, 24)
     with pytest.raises(CollectionHeld):
-        collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS)
+        collect(chunk_map)
 
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS, confirmed=True) == 4
+    assert collect(chunk_map, confirmed=True) == 4
     assert chunk_map.objects() == live
     assert len(chunk_map.objects("trash/")) == 4
     assert read_hold(chunk_map.store) is None
@@ -179,40 +179,38 @@ def test_hold_ends_by_itself_once_the_catalog_knows_the_objects_again(
     chunk_map.age({key}, 2 * DAY_SECONDS)
     chunk_map.change(Photo, photo_id, object_key="originals/other")
     with pytest.raises(CollectionHeld):
-        collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS)
+        collect(chunk_map)
     chunk_map.change(Photo, photo_id, object_key=key)
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 0
+    assert collect(chunk_map) == 0
     assert read_hold(chunk_map.store) is None
 
 
 def test_single_orphan_is_held_where_the_catalog_adopted_the_store(chunk_map: ChunkMap) -> None:
-    chunk_map.store.put(orphan := new_original_key(), b"orphan")
-    chunk_map.age({orphan}, 2 * DAY_SECONDS)
+    put_orphans(chunk_map, orphan := new_original_key())
     write_hold(chunk_map.store, Hold(HoldReason.ADOPTED, 1, 6, 1))
     assert (
         collect_orphans(chunk_map.catalog, chunk_map.store, 3 * DAY_SECONDS) == 0
     )  # it is too young
     with pytest.raises(CollectionHeld) as caught:
-        collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS)
+        collect(chunk_map)
     assert caught.value.hold.reason == HoldReason.ADOPTED
     assert chunk_map.objects() == {orphan}
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS, confirmed=True) == 1
+    assert collect(chunk_map, confirmed=True) == 1
 
 
 def test_no_orphan_is_moved_with_a_catalog_that_is_older_than_its_store(
     chunk_map: ChunkMap,
 ) -> None:
-    chunk_map.store.put(orphan := new_original_key(), b"orphan")
-    chunk_map.age({orphan}, 2 * DAY_SECONDS)
+    put_orphans(chunk_map, orphan := new_original_key())
     write_journal(chunk_map.catalog, chunk_map.store)
     with chunk_map.catalog.write() as session:
         get_or_create_installation(session).journal_sequence = 0
     with pytest.raises(Misconfigured) as caught:
-        collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS, confirmed=True)
+        collect(chunk_map, confirmed=True)
     assert caught.value.code == "catalog_behind"
     assert orphan in chunk_map.objects()
     adopt_store(chunk_map.catalog, chunk_map.store)
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 1
+    assert collect(chunk_map) == 1
 
 
 def test_an_orphan_goes_once_no_row_refers_to_it_any_more(chunk_map: ChunkMap) -> None:
@@ -220,12 +218,12 @@ def test_an_orphan_goes_once_no_row_refers_to_it_any_more(chunk_map: ChunkMap) -
     chunk_map.age(live, 2 * DAY_SECONDS)
     with chunk_map.catalog.write() as session:
         session.execute(update(Job).values(state=JobState.FAILED))  # the import, too
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 1
+    assert collect(chunk_map) == 1
     assert len(chunk_map.objects("vocabularies/")) == 1
     with chunk_map.catalog.read() as session:
         photo_id = session.scalars(select(Photo.id)).one()
     chunk_map.delete(photo_id)
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 2
+    assert collect(chunk_map) == 2
     # Left by a batch that met the deletion.
     assert chunk_map.objects("thumbnails/") == chunk_map.objects("previews/") == set()
 
@@ -234,10 +232,8 @@ def test_files_that_people_put_beside_the_originals_are_not_removed(chunk_map: C
     # The AnyLoc similarity service names its photos by a random UUID and their ending.
     theirs = {"originals/.DS_Store", "originals/holiday.jpg", f"originals/{uuid4()}.jpg"}
     orphan = new_original_key(".jpg")
-    for key in (*theirs, orphan):
-        chunk_map.store.put(key, b"not ours")
-    chunk_map.age({*theirs, orphan}, 2 * DAY_SECONDS)
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == 1
+    put_orphans(chunk_map, *theirs, orphan)
+    assert collect(chunk_map) == 1
     assert chunk_map.objects() == theirs
 
 
@@ -254,11 +250,9 @@ def test_stray_files_stop_no_collection_and_go_with_the_orphans(chunk_map: Chunk
         "queries/not-a-uuid.npy",
         "queries/deep/er",
     }
-    orphan = query_key(new_id())
-    for key in (*stray, orphan):
-        chunk_map.store.put(key, b"?")
-    chunk_map.age(chunk_map.objects(), 2 * DAY_SECONDS)
-    assert collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) == len(stray) + 1
+    put_orphans(chunk_map, *stray, query_key(new_id()))
+    chunk_map.age(live, 2 * DAY_SECONDS)
+    assert collect(chunk_map) == len(stray) + 1
     assert chunk_map.objects() == live
 
 
@@ -268,9 +262,8 @@ def test_more_orphans_than_one_run_takes_go_in_the_next_one(
     monkeypatch.setattr(orphans_module, "OBJECTS_PER_LOOKUP", 3)
     monkeypatch.setattr(orphans_module, "MAX_ORPHANS_PER_RUN", 5)
     live = _live_objects(chunk_map)
-    for _ in range(8):
-        chunk_map.store.put(new_original_key(), b"orphan")
-    chunk_map.age(chunk_map.objects(), 2 * DAY_SECONDS)
-    moved = [collect_orphans(chunk_map.catalog, chunk_map.store, DAY_SECONDS) for _ in range(3)]
+    put_orphans(chunk_map, *(new_original_key() for _ in range(8)))
+    chunk_map.age(live, 2 * DAY_SECONDS)
+    moved = [collect(chunk_map) for _ in range(3)]
     assert moved == [5, 3, 0]
     assert chunk_map.objects() == live

@@ -103,15 +103,6 @@ def test_a_photo_that_was_not_described_keeps_its_job_and_can_be_queued_again(
     service.json("DELETE", f"/uploads/{first['file_id']}")
 
 
-def test_an_old_failure_that_was_tried_again_is_not_old(service: Service, catalog: Catalog) -> None:
-    job_id = service.upload(photo_bytes(1))["job_id"]
-    service.json("POST", f"/jobs/{job_id}/cancel")
-    age_jobs(catalog, 10 * DAYS)
-    service.json("POST", f"/jobs/{job_id}/retry")
-    delete_old_jobs(catalog)
-    assert service.json("GET", f"/jobs/{job_id}")["state"] == "queued"
-
-
 def test_searches_go_when_their_days_are_over(service: Service, catalog: Catalog) -> None:
     (photo,) = service.indexed(1)
     for _ in range(2):

@@ -12,11 +12,8 @@ from sqlalchemy import select
 from services.steward.periodic_tasks import PeriodicTask
 from services.steward.scheduler import Scheduler
 from services.steward.tasks import auto_fit
-from services.steward.tasks.compaction import COMPACT_CHUNKS, merge_slot
-from services.steward.tasks.garbage_collection import (
-    collect_ended_generations,
-    collect_garbage,
-)
+from services.steward.tasks.compaction import COMPACT_CHUNKS
+from services.steward.tasks.garbage_collection import collect_ended_generations, collect_garbage
 from services.steward.tasks.maintenance import resend_wakeups
 from shared.catalog import vocabularies
 from shared.catalog.database.base import db_now_plus
@@ -27,10 +24,7 @@ from shared.catalog.photos import Photo, PresignedUpload
 from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups, Job, JobKind, JobState
 from shared.storage import FolderStore
-from shared.storage.keys import (
-    incoming_key,
-    new_original_key,
-)
+from shared.storage.keys import incoming_key, new_original_key
 from tests.integration.steward.chunk_map import HOUR_SECONDS, ChunkMap
 from tests.integration.steward.test_compaction import sum_of
 from tests.integration.steward.test_garbage_collection import add_one_job
@@ -51,7 +45,7 @@ pytestmark = pytest.mark.databases("postgresql")
 @pytest.mark.databases("sqlite", "postgresql")
 def test_collecting_twice_at_once_harms_nothing(chunk_map: ChunkMap) -> None:
     retained = sum_of(chunk_map.chunks(2, 2))
-    merge_slot(chunk_map.catalog, chunk_map.store, chunk_map.generation_id, 0)
+    chunk_map.merge_slot()
     gone = [
         upload(chunk_map.catalog, chunk_map.store, chunk_map.map_id, bytes([n]))[0]
         for n in range(6)

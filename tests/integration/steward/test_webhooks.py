@@ -6,7 +6,6 @@ The tests of what is delivered, claimed and retried run on SQLite as well.
 from __future__ import annotations
 
 import asyncio
-import logging
 import socket
 import ssl
 import threading
@@ -32,7 +31,7 @@ from shared.catalog.database.base import db_now
 from shared.catalog.database.session import Catalog
 from shared.catalog.webhooks import Delivery, EventKind, Webhook, enqueue_event
 from shared.config.settings import Settings
-from shared.jobs import InProcessWakeups, Job, JobState
+from shared.jobs import InProcessWakeups, JobState
 from shared.security.webhook_targets import WebhookTarget, parse_webhook_url
 from shared.storage import FolderStore
 from shared.storage.keys import preview_key
@@ -44,6 +43,7 @@ from tests.integration.steward.webhook_receiver import (
     receiving,
 )
 from tests.integration.workplace import Workplace
+from tests.support.catalog_rows import end_pauses
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 
@@ -178,6 +178,9 @@ def test_a_described_photo_is_delivered_and_signed(hooks: WebhookSetup) -> None:
     )
     assert message.headers["webhook-id"] == f"msg_{delivery['event_id']}"
     assert hooks.send() == 0, "a successful delivery is not repeated"
+    listed = hooks.door(ADMIN, "GET", "/webhooks")
+    assert [webhook["id"] for webhook in listed.json()] == [hooks.webhook["id"]]
+    assert hooks.webhook["secret"] not in listed.text, "it is shown once"
 
 
 def test_a_photo_whose_preview_is_made_again_is_not_delivered_again(hooks: WebhookSetup) -> None:
@@ -433,31 +436,8 @@ def test_a_deleted_webhook_gets_nothing_more(hooks: WebhookSetup) -> None:
     )
 
 
-def test_its_secret_is_shown_once_and_never_logged(
-    hooks: WebhookSetup, caplog: pytest.LogCaptureFixture
-) -> None:
-    with caplog.at_level(logging.DEBUG):
-        secret = hooks.webhook["secret"]
-        listed = hooks.door(ADMIN, "GET", "/webhooks")
-        assert [webhook["id"] for webhook in listed.json()] == [hooks.webhook["id"]]
-        assert secret not in listed.text
-        hooks.photo()
-        hooks.send()
-    assert secret not in caplog.text
-
-
-@pytest.mark.parametrize(
-    "url",
-    [
-        "https://127.0.0.1/",
-        "https://localhost/",
-        "https://169.254.169.254/latest/meta-data/",
-        "https://[::ffff:10.0.0.1]/",
-        "http://example.com/",
-        "https://no-such-name.invalid/",
-    ],
-)
-def test_a_webhook_to_a_machine_of_our_own_is_refused(
+@pytest.mark.parametrize("url", ["https://localhost/", "https://no-such-name.invalid/"])
+def test_a_webhook_to_a_machine_of_our_own_or_to_none_is_refused(
     sqlite_catalog: Catalog, store: FolderStore, url: str
 ) -> None:
     door = Door(sqlite_catalog, store, Settings())
@@ -466,7 +446,7 @@ def test_a_webhook_to_a_machine_of_our_own_is_refused(
     assert door(ADMIN, "GET", "/webhooks").json() == []
 
 
-def test_a_failed_job_and_a_finished_batch_are_delivered(
+def test_a_finished_batch_is_delivered_with_the_jobs_of_it_and_its_photo(
     hooks: WebhookSetup, settings: Settings
 ) -> None:
     batches = hooks.add("batch.finished")
@@ -477,8 +457,7 @@ def test_a_failed_job_and_a_finished_batch_are_delivered(
     worker = BatchWorker(hooks.door.catalog, store, InProcessWakeups(), settings, "steward")
     worker.run_next(threading.Event())
     hooks.describe()
-    with hooks.door.catalog.write() as session:
-        session.execute(update(Job).values(run_after=None))
+    end_pauses(hooks.door.catalog)
     worker.run_next(threading.Event())
     (delivery,) = hooks.log(batches)
     assert delivery["event"] == "batch.finished"

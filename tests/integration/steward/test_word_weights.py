@@ -29,7 +29,7 @@ from shared.jobs import Job, JobKind, JobState, Priority
 from shared.storage import ObjectStore
 from shared.word_weights.record import Outcome, WordWeights, parse_word_weights
 from tests.integration.in_process_api import Service
-from tests.support.catalog_rows import add_chunk, add_generation, add_photo, read_job
+from tests.support.catalog_rows import add_chunk, add_generation, add_photo, failure_code, read_job
 from tests.support.problems import problem
 
 # tests/e2e/test_word_weights_command.py runs the job on SQLite.
@@ -235,9 +235,7 @@ def test_rows_that_can_not_be_read_end_the_learning_and_keep_nothing(city: City)
     city.store.put(key, city.store.get(key)[:-200])
     job_id = city.start()
     assert city.work()
-    job = read_job(city.catalog, job_id)
-    assert job.error is not None
-    assert (job.state, job.error["code"]) == (JobState.FAILED, "map_damaged")
+    assert failure_code(read_job(city.catalog, job_id)) == "map_damaged"
     assert city.record() is None
 
 
@@ -257,10 +255,7 @@ def test_generations_without_words_get_none(city: City) -> None:
 def _refused(city: City) -> str:
     job_id = city.start()
     assert city.work()
-    error = read_job(city.catalog, job_id).error
-    assert error is not None
-    code: str = error["code"]
-    return code
+    return failure_code(read_job(city.catalog, job_id))
 
 
 # --- by themselves ---------------------------------------------------------------------------
