@@ -51,7 +51,7 @@ def similar(service: Service, photo: str) -> dict[str, Any]:
     return found
 
 
-@pytest.mark.parametrize("damage", ["flipped", "truncated", "gone"])
+@pytest.mark.parametrize("damage", ["flipped", "gone"])
 def test_the_rest_is_answered_and_the_chunk_named_until_it_is_repaired(
     service: Service, monkeypatch: pytest.MonkeyPatch, damage: str
 ) -> None:
@@ -69,7 +69,7 @@ def test_the_rest_is_answered_and_the_chunk_named_until_it_is_repaired(
     if damage == "gone":
         service.store.delete(key)
     else:
-        service.store.put(key, data[:-1] + (b"x" if damage == "flipped" else b""))
+        service.store.put(key, data[:-1] + bytes([data[-1] ^ 1]))
 
     service = restarted(service)
     found = similar(service, searched)

@@ -76,6 +76,13 @@ def test_uploads_are_searched_by_their_float16_rows_before_and_after_a_merge(
     before = [answers(service, photo_id) for photo_id in photos]
     for photo_id, found in zip(photos, before, strict=True):
         assert_same(found, brute_force(rows, photo_id))
+    job = service.ask(photo_bytes(3), map_name="half")
+    service.drain()
+    service.search.sync()
+    result = service.json("GET", f"/jobs/{job}/result", params={"map": "half"})
+    best = result["similar_images"][0]
+    assert best["image_id"] == photos[2], "a photo that is not stored, too"
+    assert best["similarity_score"] == pytest.approx(1.0, abs=1e-4)
     assert merge_small_chunks(service.catalog, store, compact_chunks=2) == 1
     merged = rows_of(service)
     assert {row.dtype for row in merged.values()} == {np.dtype(np.float16)}
@@ -99,50 +106,41 @@ def test_exported_descriptors_are_the_stored_rows_in_float32(service: Service) -
     assert sorted(map(bytes, exported)) == sorted(map(bytes, stored.astype(np.float32)))
 
 
-def test_an_old_map_keeps_its_rows_until_its_next_generation(
-    service: Service, catalog: Catalog
+def test_rows_of_a_map_are_rounded_by_its_next_generation_and_described_again_for_more_precision(
+    service: Service, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     body = {"name": "half", "extractor": "test-tiny-avg", "rows": "float32"}
     service.json("POST", "/maps", 201, json=body)
     photos = service.indexed(1, 2, 3, map_name="half")
     changed = service.json("PATCH", "/maps/half", json={"rows": "float16"})
     assert changed["rows"] == "float16"
-    photos += service.indexed(4, map_name="half")
-    assert generation(service)["rows"] == "float32"
-    assert {row.dtype for row in rows_of(service).values()} == {np.dtype(np.float32)}
+    (late,) = service.indexed(4, map_name="half")
+    assert generation(service)["rows"] == "float32", "until the next generation"
+    full = rows_of(service)
+    assert {row.dtype for row in full.values()} == {np.dtype(np.float32)}
+    service.json("DELETE", f"/uploads/{late}", params={"map": "half"})
     before = answers(service, photos[0])
-    reindex(service, catalog)
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError("a photo was decoded")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(LentDecoders, "decode", refuse)
+        reindex(service, catalog)
     assert generation(service)["rows"] == "float16"
-    assert {row.dtype for row in rows_of(service).values()} == {np.dtype(np.float16)}
+    rounded = rows_of(service)
+    assert {row.dtype for row in rounded.values()} == {np.dtype(np.float16)}
+    assert set(rounded) == {UUID(photo_id) for photo_id in photos}
+    assert all((row == full[photo_id].astype("float16")).all() for photo_id, row in rounded.items())
     after = answers(service, photos[0])
     assert [photo_id for photo_id, _ in after] == [photo_id for photo_id, _ in before]
     np.testing.assert_allclose([s for _, s in after], [s for _, s in before], atol=1e-3)
 
-
-def test_rows_are_rounded_without_their_photos_and_described_again_for_more_precision(
-    service: Service, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    body = {"name": "half", "extractor": "test-tiny-avg", "rows": "float32"}
-    service.json("POST", "/maps", 201, json=body)
-    photos = service.indexed(1, 2, 3, map_name="half")
-    full = rows_of(service)
-    service.json("PATCH", "/maps/half", json={"rows": "float16"})
-    service.json("DELETE", f"/uploads/{photos[0]}", params={"map": "half"})
-    with monkeypatch.context() as patched:
-        patched.setattr(LentDecoders, "decode", _refuse_decoding)
-        reindex(service, catalog)
-    rounded = rows_of(service)
-    assert set(rounded) == {UUID(photo_id) for photo_id in photos[1:]}
-    assert all((row == full[photo_id].astype("float16")).all() for photo_id, row in rounded.items())
     service.json("PATCH", "/maps/half", json={"rows": "float32"})
     reindex(service, catalog)
     again = rows_of(service)
     assert all((row == full[photo_id]).all() for photo_id, row in again.items())
     assert {row.dtype for row in again.values()} == {np.dtype(np.float32)}
-
-
-def _refuse_decoding(*_: Any, **__: Any) -> None:
-    raise AssertionError("a photo was decoded")
 
 
 def reindex(service: Service, catalog: Catalog) -> None:
@@ -158,20 +156,3 @@ def reindex(service: Service, catalog: Catalog) -> None:
         advance_model_changes(catalog, InProcessWakeups())
     assert generation(service)["state"] == "active"
     assert generation(service)["generation_id"] != before
-
-
-def test_an_unknown_type_of_rows_is_refused(service: Service) -> None:
-    answer = service("POST", "/maps", json={"name": "half", "rows": "int8"})
-    assert answer.status_code == 422
-    assert "rows" in answer.text
-
-
-def test_a_photo_that_is_not_stored_is_searched_in_float16_rows(service: Service) -> None:
-    photos = half_map(service)
-    job = service.ask(photo_bytes(3), map_name="half")
-    service.drain()
-    service.search.sync()
-    found = service.json("GET", f"/jobs/{job}/result", params={"map": "half"})
-    best = found["similar_images"][0]
-    assert best["image_id"] == photos[2]
-    assert best["similarity_score"] == pytest.approx(1.0, abs=1e-4)
