@@ -17,7 +17,6 @@ from services.steward.tasks.maintenance import resend_wakeups
 from shared.catalog.database.session import Catalog
 from shared.catalog.installation import open_installation_store
 from shared.config.settings import Settings
-from shared.errors import Misconfigured
 from shared.jobs import Job, JobState, celery_wakeups
 from shared.jobs.celery_wakeups import (
     BROKER_TIMEOUT_SECONDS,
@@ -114,12 +113,6 @@ def test_closing_in_the_middle_of_a_burst_takes_no_time(
     begun = time.monotonic()
     wakeups.close()
     assert time.monotonic() - begun < BROKER_TIMEOUT_SECONDS
-
-
-def test_services_without_redis_say_what_to_set() -> None:
-    with pytest.raises(Misconfigured, match="REDIS_URL") as caught:
-        create_celery_app(Settings())
-    assert caught.value.code == "redis_missing"
 
 
 class Extractor:

@@ -80,16 +80,6 @@ def test_photos_of_a_batch_carry_the_id_of_its_call(service: Service) -> None:
     assert sorted(made) == [(JobKind.BATCH, ID), (JobKind.INDEX, ID), (JobKind.INDEX, ID)]
 
 
-def test_an_unforeseen_error_answers_with_the_id_and_logs_it(
-    service: Service, log: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("services.gateway.routes.jobs.list_jobs", lambda *_: 1 / 0)
-    answer = service("GET", "/jobs", headers={"X-Request-ID": ID})
-    assert (answer.status_code, answer.json()["request_id"]) == (500, ID)
-    failed = [line for line in log.records if line.getMessage() == "GET /api/v1/jobs: 500"]
-    assert [line.levelno for line in failed] == [logging.INFO]
-
-
 def test_a_trace_leads_from_the_call_to_the_transaction_that_makes_it_searchable(
     service: Service,
 ) -> None:
