@@ -197,6 +197,17 @@ def test_a_photo_whose_preview_is_made_again_is_not_delivered_again(hooks: Webho
     assert hooks.send() == 0
 
 
+def test_a_failed_job_is_delivered_with_its_error(hooks: WebhookSetup) -> None:
+    torn = photo_bytes(1, "PNG")[:-100]
+    uploaded = hooks.door(ADMIN, "POST", "/upload", files={"file": ("torn.png", torn)}).json()
+    hooks.describe()
+    assert hooks.send() == 1
+    (message,) = hooks.receiver.messages
+    body = message.json()
+    assert (body["type"], body["data"]["job_id"]) == ("job.failed", uploaded["job_id"])
+    assert body["data"]["error"]["code"] == "undecodable_photo"
+
+
 @BOTH_DATABASES
 def test_only_subscribed_events_are_delivered_and_to_each_webhook_alone(
     hooks: WebhookSetup,
