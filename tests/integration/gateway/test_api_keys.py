@@ -37,32 +37,24 @@ def test_a_key_is_shown_once_and_kept_as_a_hash(door: Door) -> None:
     assert key not in str(vars(row))
 
 
-def test_each_scope_opens_its_calls_and_no_others(door: Door) -> None:
+def test_each_scope_opens_its_calls_and_no_others(door: Door, store: FolderStore) -> None:
     reads, writes = door.key("read")["key"], door.key("write")["key"]
     rules = door.key("admin")["key"]
     assert door(reads, "GET", "/jobs").status_code == 200
     problem(door.put(reads), 403, "scope_missing")
+    assert list(store.list("")) == [], "a refused upload stores nothing"
     problem(door(reads, "GET", "/keys"), 403, "scope_missing")
-    assert door.put(writes).status_code == 202
+    stored = door.put(writes)
+    assert stored.status_code == 202
+    photo = f"/uploads/{stored.json()['file_id']}"
+    assert door(reads, "GET", f"{photo}/image").content == photo_bytes(1)
+    problem(door(reads, "GET", f"{photo}/thumbnail"), 404, "thumbnail_not_found")
+    for part in ("image", "thumbnail"):
+        problem(door(writes, "GET", f"{photo}/{part}"), 403, "scope_missing")
     assert problem(door(writes, "GET", "/jobs"), 403, "scope_missing")["needed"] == ["read"]
     problem(door(writes, "POST", "/keys", json={}), 403, "scope_missing")
     for call in (door(rules, "GET", "/jobs"), door(rules, "GET", "/keys"), door.put(rules)):
         assert call.is_success
-
-
-def test_originals_and_thumbnails_are_for_those_who_may_read(door: Door) -> None:
-    file_id = door.put(ADMIN).json()["file_id"]
-    reads, writes = door.key("read")["key"], door.key("write")["key"]
-    image = f"/uploads/{file_id}/image"
-    assert door(reads, "GET", image).content == photo_bytes(1)
-    problem(door(reads, "GET", f"/uploads/{file_id}/thumbnail"), 404, "thumbnail_not_found")
-    for path in (image, f"/uploads/{file_id}/thumbnail"):
-        problem(door(writes, "GET", path), 403, "scope_missing")
-
-
-def test_a_refused_upload_stores_nothing(door: Door, store: FolderStore) -> None:
-    problem(door.put(door.key("read")["key"]), 403, "scope_missing")
-    assert list(store.list("")) == []
 
 
 def test_a_revoked_key_opens_nothing_from_then_on(door: Door) -> None:
@@ -119,15 +111,10 @@ def test_a_photo_says_which_key_it_came_in_with(door: Door) -> None:
     "params",
     [
         {},
-        {"name": "", "scopes": ["read"]},
         {"name": "x", "scopes": []},
-        {"name": "x", "scopes": ["root"]},
         {"name": "x", "scopes": ["read"], "days": 0},
-        {"name": "x", "scopes": ["read"], "max_photos": 0},
         {"name": "x\0", "scopes": ["read"]},
         {"name": "x", "scopes": ["read"], "maps": ["a\0"]},
-        {"name": "x", "scopes": ["read"], "maps": [""]},
-        {"name": "x", "scopes": ["read"], "maps": ["a" * 101]},
         {"name": "x", "scopes": ["read"], "maps": ["*"]},
         {"name": "x", "scopes": ["read"], "key": "chosen"},
     ],

@@ -21,7 +21,7 @@ from fastapi import FastAPI, Request
 from fastapi.responses import StreamingResponse
 
 from services.http_connections import ConnectionLimits, Connections, Reason, address_group
-from services.http_server import http_server, listen
+from services.http_server import PEER_ADDRESS, http_server, listen
 from services.request_log import RequestLogMiddleware, RequestRecord
 from shared.config.settings import Settings
 from shared.http.problem_details import CLIENT_GONE, install_exception_handlers
@@ -69,7 +69,7 @@ def serving(**limits: Any) -> Iterator[Running]:
         @app.get("/whoami")
         async def whoami(request: Request) -> str:
             assert request.client is not None
-            return request.client.host
+            return f"{request.client.host} from {request.scope[PEER_ADDRESS]}"
 
         @app.get("/held")
         def held() -> str:
@@ -173,10 +173,10 @@ def test_a_trusted_proxy_has_any_number_of_connections_and_says_who_calls() -> N
             proxied = [held.enter_context(server.connect("127.0.0.2")) for _ in range(5)]
             for client in proxied:
                 client.sendall(forwarded)
-                assert b"192.0.2.7" in answer_of(client)
+                assert b"192.0.2.7 from 127.0.0.2" in answer_of(client)
         with server.connect() as stranger:
             stranger.sendall(forwarded)
-            assert b"127.0.0.1" in answer_of(stranger), "others are not believed"
+            assert b"127.0.0.1 from 127.0.0.1" in answer_of(stranger), "others are not believed"
 
 
 def test_a_head_that_does_not_come_in_time_ends_the_connection() -> None:

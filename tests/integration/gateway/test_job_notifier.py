@@ -85,11 +85,10 @@ def test_one_slow_poll_does_not_delay_the_next_ones(catalog: Catalog, jobs: list
         asyncio.run(scenario())
 
 
-def test_job_that_is_gone_is_not_waited_for(catalog: Catalog) -> None:
+def test_waiting_ends_when_the_job_is_gone_or_the_time_is_up(
+    catalog: Catalog, jobs: list[UUID]
+) -> None:
     asyncio.run(JobNotifier(catalog).wait_until_finished(new_id(), LONG))
-
-
-def test_waiting_ends_when_the_time_is_up(catalog: Catalog, jobs: list[UUID]) -> None:
     asyncio.run(JobNotifier(catalog).wait_until_finished(jobs[0], 0.05))
 
 

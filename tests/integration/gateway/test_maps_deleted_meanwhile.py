@@ -93,13 +93,6 @@ def test_a_claimed_batch_is_not_published_into_a_map_that_was_deleted(
     assert service.json("GET", f"/uploads/{stays}")["searchable"]
 
 
-def test_jobs_of_a_deleted_map_are_not_taken(service: Service) -> None:
-    service.json("POST", "/maps", 201, json={"name": "gone"})
-    service.upload(photo_bytes(1), "gone")
-    service.json("DELETE", "/maps/gone")
-    assert service.worker.drain(threading.Event()).claimed == 0
-
-
 def test_jobs_of_a_deleted_map_are_cancelled_in_small_transactions(
     service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,6 +13,8 @@ from tests.integration.in_process_api import Service
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 
+pytestmark = pytest.mark.databases("sqlite")
+
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
 
 
@@ -34,7 +36,6 @@ def propose(service: Service, *photos: dict[str, Any], **options: Any) -> list[d
     return proposals
 
 
-@pytest.mark.databases("sqlite")
 def test_time_and_camera_are_read_from_the_begin_of_a_photo(service: Service) -> None:
     exif = Image.Exif()
     exif[Base.Model] = "Camera"
@@ -53,7 +54,6 @@ def test_time_and_camera_are_read_from_the_begin_of_a_photo(service: Service) ->
     assert problem(refused, 422, "undecodable_photo")
 
 
-@pytest.mark.databases("sqlite")
 def test_searches_neighbours_and_a_track_are_combined(service: Service) -> None:
     for number in range(3):
         service.upload(photo_bytes(number), latitude=45 + number / 1000, longitude=7.0)
@@ -79,7 +79,6 @@ def test_searches_neighbours_and_a_track_are_combined(service: Service) -> None:
     assert (nothing["latitude"], nothing["probability"]) == (None, 0)
 
 
-@pytest.mark.databases("sqlite")
 def test_bodies_that_cannot_be_computed_are_refused(service: Service) -> None:
     half = {**dated("a.jpg", 0), "latitude": 45.0}
     many = [{"name": str(number)} for number in range(101)]
@@ -88,7 +87,6 @@ def test_bodies_that_cannot_be_computed_are_refused(service: Service) -> None:
         assert problem(answer, 422, "invalid_field")
 
 
-@pytest.mark.databases("sqlite")
 def test_a_folder_of_thousands_of_photos_is_one_call(service: Service) -> None:
     similar = [
         {"name": f"IMG_20260501_{number:06}.jpg", "latitude": 45.0, "longitude": 7.0, "score": 0.9}
@@ -102,7 +100,6 @@ def test_a_folder_of_thousands_of_photos_is_one_call(service: Service) -> None:
     assert problem(large, 413, "body_too_large")
 
 
-@pytest.mark.databases("sqlite")
 @pytest.mark.parametrize("path", ["/positions", "/photo-headers"])
 def test_a_large_body_is_not_read_because_it_is_called_a_form(service: Service, path: str) -> None:
     form = {"Content-Type": "multipart/form-data; boundary=a"}
