@@ -11,13 +11,10 @@ import uvicorn
 from services.http_server import lan_url, reachable_url, stop_on_signals
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "localhost"])
-def test_a_loopback_address_has_no_url_for_other_devices(host: str) -> None:
-    assert lan_url(host, 8000) is None
-
-
-def test_an_address_of_the_network_is_its_own_url() -> None:
+def test_an_address_of_the_network_is_its_own_url_and_loopback_has_none_for_others() -> None:
     assert lan_url("192.168.1.23", 8000) == "http://192.168.1.23:8000"
+    for host in ("127.0.0.1", "::1", "localhost"):
+        assert lan_url(host, 8000) is None
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])

@@ -55,8 +55,6 @@ def test_browsers_get_the_page_and_programs_what_this_is(page: TestClient) -> No
         ("views/ask.js", "text/javascript; charset=utf-8"),
         ("style.css", "text/css; charset=utf-8"),
         ("mark.svg", "image/svg+xml"),
-        ("leaflet/leaflet.js", "text/javascript; charset=utf-8"),
-        ("api/swagger-ui-bundle.js", "text/javascript; charset=utf-8"),
     ],
 )
 def test_files_have_their_type_and_are_small_on_the_way(
