@@ -15,7 +15,7 @@ import pytest
 from placewise.client import Client
 from shared.errors import InvalidRequest
 from tests.e2e.test_separate_services import Deployment, until
-from tests.support.archives import PACKED, zip_of
+from tests.support.archives import zip_of
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess, environment, run_command
 from tests.support.servers import PostgresServer, S3Server, start_redis
@@ -45,21 +45,6 @@ def form(*numbers: int) -> list[tuple[str, Any]]:
 def client(server: ServerProcess) -> Iterator[Client]:
     with Client(str(server.client.base_url)) as opened:
         yield opened
-
-
-def test_files_are_searchable_when_their_job_has_succeeded(server: ServerProcess) -> None:
-    answer = server.client.post("/api/v1/upload/batch", files=form(*range(100, 112)))
-    assert answer.status_code == 202
-    started = answer.json()
-    assert answer.headers["location"] == started["status_url"]
-    job = server.finished(started["job_id"])
-    assert job["state"] == "succeeded", job
-    assert job["kind"] == "batch"
-    assert job["progress"] == {"done": 12, "total": 12, "failed": 0}
-    items = server.client.get(started["items_url"]).json()["items"]
-    assert [item["name"] for item in items] == [f"{number}.jpg" for number in range(100, 112)]
-    found = server.ask(photo_bytes(105), top_k=1).json()["similar_images"][0]
-    assert (found["original_filename"], found["latitude"]) == ("105.jpg", 45.105)
 
 
 def test_the_client_sends_files_with_a_manifest_and_names_of_objects(
@@ -113,15 +98,12 @@ def index(server: ServerProcess, path: Path, *options: str, code: int = 0) -> di
     return report
 
 
-@pytest.mark.parametrize("kind", ["zip", "tar.gz"])
-def test_index_takes_an_archive_as_it_takes_a_folder(
-    server: ServerProcess, tmp_path: Path, kind: str
-) -> None:
-    first = 140 if kind == "zip" else 150
+def test_index_takes_an_archive_as_it_takes_a_folder(server: ServerProcess, tmp_path: Path) -> None:
+    first = 140
     members = {f"trip/{name}": data for name, data in photos(*range(first, first + 4)).items()}
     members |= {"trip/bad.jpg": b"no photo", "trip/notes.txt": b"of the trip"}
     path = tmp_path / "photos"  # its name says nothing
-    path.write_bytes(PACKED[kind]({**members, "trip/photos.csv": table(first)}))
+    path.write_bytes(zip_of({**members, "trip/photos.csv": table(first)}))
     journal = ("--journal", str(tmp_path / "journal.jsonl"))
     report = index(server, path, *journal, code=1)
     assert (report["photos"], report["uploaded"], report["already_there"]) == (5, 4, 0)
@@ -137,31 +119,6 @@ def test_index_takes_an_archive_as_it_takes_a_folder(
     assert (report["uploaded"], report["already_there"]) == (0, 4)
     assert len(Path(journal[1]).read_text().splitlines()) == 5, "none was sent again"
     assert sorted(each.name for each in tmp_path.iterdir()) == ["journal.jsonl", "photos"]
-
-
-def test_index_takes_the_options_of_a_folder_for_an_archive(
-    server: ServerProcess, tmp_path: Path
-) -> None:
-    path = tmp_path / "rooms.zip"
-    path.write_bytes(zip_of({"hall/160.jpg": photo_bytes(160), "161.jpg": photo_bytes(161)}))
-    places = tmp_path / "places.csv"
-    places.write_bytes(b"filename,latitude,longitude\nhall/160.jpg,45.5,7\n")
-    index(server, path, "--places-by-folder", "--csv", str(places))
-    found = server.ask(photo_bytes(160), top_k=1).json()["similar_images"][0]
-    assert (found["place"], found["latitude"]) == ("hall", 45.5)
-    path.write_bytes(zip_of({"162.jpg": photo_bytes(162)}))
-    index(server, path, "--role", "query")
-    found = server.ask(photo_bytes(162), top_k=1).json()["similar_images"][0]
-    assert found["original_filename"] != "162.jpg"
-
-
-def test_index_rejects_what_holds_no_photos(server: ServerProcess, tmp_path: Path) -> None:
-    path = tmp_path / "photos.zip"
-    path.write_bytes(b"not a zip, whatever its name says" * 50)
-    assert index(server, path, code=1)["code"] == "unsupported_source"
-    assert index(server, tmp_path / "nothing.zip", code=1)["code"] == "unreadable_file"
-    path.write_bytes(zip_of({"readme.txt": b"hello"}))
-    assert index(server, path, code=1)["code"] == "no_photos"
 
 
 def test_index_takes_a_list_goes_on_after_a_break_and_writes_what_failed(

@@ -1,4 +1,4 @@
-"""`placewise index` of photos that are there already, and of queries."""
+"""`placewise index` of photos that are there already."""
 
 from __future__ import annotations
 
@@ -52,29 +52,3 @@ def test_a_corrected_table_is_refused_by_name_and_taken_with_update(
 def test_a_blank_where_an_address_had_a_plus_is_read_as_plus(server: ServerProcess) -> None:
     expected = "/api/v1/search?captured_after=2026-05-01T12:00:00+02:00"
     assert server.client.get(expected).status_code == 200
-
-
-def test_an_outsider_stays_one_however_narrow_the_filter(server: ServerProcess) -> None:
-    client = server.client
-    client.post("/api/v1/maps", json={"name": "narrow"}).raise_for_status()
-    for number in range(30):
-        server.client.post(
-            "/api/v1/upload",
-            params={"map": "narrow"},
-            files={"file": ("p.jpg", photo_bytes(710 + number))},
-            data={"latitude": str(45 + number / 100), "longitude": "7"},
-            headers={"Prefer": "wait=30"},
-        ).raise_for_status()
-    job = client.post("/api/v1/evaluations", params={"map": "narrow"}).json()
-    done = client.get(f"/api/v1/jobs/{job['job_id']}", params={"map": "narrow", "wait": 30}).json()
-    assert done["state"] == "succeeded", done
-    refused = 0
-    for number in range(12):
-        stranger = photo_bytes(800 + number)
-        whole = server.ask(stranger, map="narrow").json()["estimate"]
-        for near in ("45.05,7,1", "45.2,7,2000"):
-            narrow = server.ask(stranger, map="narrow", near=near).json()["estimate"]
-            if whole["in_map"] is False:
-                assert narrow["in_map"] is False
-                refused += 1
-    assert refused >= 12

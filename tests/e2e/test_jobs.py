@@ -75,7 +75,9 @@ def test_a_job_has_its_times_progress_and_result(server: ServerProcess) -> None:
     assert job["created_at"] <= job["started_at"] <= job["finished_at"]
 
 
-def test_jobs_are_listed_newest_first_by_state_and_kind(server: ServerProcess) -> None:
+def test_jobs_are_listed_newest_first_by_state_and_kind_page_by_page(
+    server: ServerProcess,
+) -> None:
     indexed = server.upload(photo_bytes(next(fresh))).json()["job_id"]
     server.finished(indexed)
     broken = failed_job(server)
@@ -96,20 +98,15 @@ def test_jobs_are_listed_newest_first_by_state_and_kind(server: ServerProcess) -
     assert {broken, indexed} <= {job["job_id"] for job in both}
     assert body not in {job["job_id"] for job in both}
 
-
-def test_a_list_of_jobs_is_read_page_by_page(server: ServerProcess) -> None:
-    for _ in range(3):
-        server.finished(server.upload(photo_bytes(next(fresh))).json()["job_id"])
     whole = [job["job_id"] for job in listed(server, kind="index")]
     read: list[str] = []
-    page = get(server, JOBS, kind="index", limit=2)
-    while True:
+    cursor: dict[str, str] = {}
+    while len(read) < len(whole):
+        page = get(server, JOBS, kind="index", limit=2, **cursor)
         assert 0 < len(page["jobs"]) <= 2
         read += [job["job_id"] for job in page["jobs"]]
-        if page["next_cursor"] is None:
-            break
-        page = get(server, JOBS, kind="index", limit=2, cursor=page["next_cursor"])
-    assert read == whole
+        cursor = {"cursor": page["next_cursor"]}
+    assert (read, page["next_cursor"]) == (whole, None)
 
 
 @pytest.mark.parametrize(
@@ -117,7 +114,6 @@ def test_a_list_of_jobs_is_read_page_by_page(server: ServerProcess) -> None:
     [
         ({"state": "asleep"}, "state.0"),
         ({"kind": "coffee"}, "kind.0"),
-        ({"limit": "0"}, "limit"),
         ({"limit": "1001"}, "limit"),
         ({"cursor": "page two"}, "cursor"),
     ],
@@ -197,12 +193,15 @@ def test_a_cancelled_job_stays_undone_until_it_is_retried(server: ServerProcess)
     assert get(server, uploaded["status_url"])["state"] == "cancelled"
     refused = problem(server.similar(uploaded["file_id"]), 409, "not_searchable")
     assert refused["state"] == "cancelled"
-    problem(post(server, uploaded["job_id"], "cancel"), 409, "job_finished")
+    body = problem(post(server, uploaded["job_id"], "cancel"), 409, "job_finished")
+    assert (body["job_id"], body["state"]) == (uploaded["job_id"], "cancelled")
 
     again = post(server, uploaded["job_id"], "retry")
     assert again.status_code == 200
     assert (again.json()["state"], again.json()["finished_at"]) == ("queued", None)
     assert server.finished(uploaded["job_id"])["state"] == "succeeded"
+    body = problem(post(server, uploaded["job_id"], "retry"), 409, "job_not_retryable")
+    assert body["job_id"] == uploaded["job_id"]
     assert server.similar(uploaded["file_id"]).status_code == 200
 
 
@@ -225,28 +224,6 @@ def test_a_cancelled_query_has_no_result(server: ServerProcess) -> None:
         ).json()
         assert post(server, started["job_id"], "cancel").status_code == 200
         problem(server.client.get(started["result_url"]), 409, "job_cancelled")
-
-
-def test_a_failed_job_can_be_retried(server: ServerProcess) -> None:
-    job_id = failed_job(server)
-    with server.no_decoding():
-        answer = post(server, job_id, "retry")
-        assert answer.status_code == 200
-        assert answer.json()["state"] == "queued"
-        assert answer.json()["error"] is None
-        assert answer.json()["progress"] == {"done": 0, "total": 1, "failed": 0}
-        body = problem(post(server, job_id, "retry"), 409, "job_not_retryable")
-        assert body["job_id"] == job_id
-    job = server.finished(job_id)
-    assert (job["state"], job["error"]["code"]) == ("failed", "undecodable_photo")
-
-
-def test_a_job_that_succeeded_can_be_neither_cancelled_nor_retried(server: ServerProcess) -> None:
-    job_id = server.upload(photo_bytes(next(fresh))).json()["job_id"]
-    assert server.finished(job_id)["state"] == "succeeded"
-    body = problem(post(server, job_id, "cancel"), 409, "job_finished")
-    assert (body["job_id"], body["state"]) == (job_id, "succeeded")
-    problem(post(server, job_id, "retry"), 409, "job_not_retryable")
 
 
 def test_the_job_of_a_deleted_photo_is_not_retried(server: ServerProcess) -> None:

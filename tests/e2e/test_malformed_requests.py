@@ -15,7 +15,7 @@ def nested(levels: int) -> str:
     return '{"a":' * levels + "1" + "}" * levels
 
 
-@pytest.mark.parametrize("levels", [33, 300, 3000])
+@pytest.mark.parametrize("levels", [33, 3000])
 def test_deeply_nested_metadata_is_refused_and_spoils_no_answer(
     server: ServerProcess, levels: int
 ) -> None:
@@ -61,11 +61,10 @@ def test_a_long_search_text_names_the_field(server: ServerProcess) -> None:
     assert answer.json()["errors"][0]["field"] == "filename"
 
 
-@pytest.mark.parametrize("path", ["/", "/livez", "/readyz", "/api/v1/health"])
-def test_probes_may_ask_for_the_head_alone(server: ServerProcess, path: str) -> None:
-    answer = server.client.head(path)
-    assert answer.status_code == 200
-    assert answer.content == b""
+def test_probes_may_ask_for_the_head_alone(server: ServerProcess) -> None:
+    for path in ("/", "/livez", "/readyz", "/api/v1/health"):
+        answer = server.client.head(path)
+        assert (answer.status_code, answer.content) == (200, b""), path
 
 
 def test_the_answer_to_a_waiting_upload_says_how_it_ended(server: ServerProcess) -> None:

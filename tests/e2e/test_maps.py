@@ -10,7 +10,6 @@ from typing import Any
 from uuid import uuid4
 
 import httpx2
-import pytest
 
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import field_refused, problem
@@ -84,14 +83,9 @@ def test_a_name_is_taken_once(server: ServerProcess) -> None:
     assert upper.status_code == 201, "case matters"
 
 
-@pytest.mark.parametrize(
-    "name", ["", " ", "a b", "a/b", "../a", ".a", "-a", "_a", "ä", "a\n", "a\0", "a" * 101, 7, None]
-)
-def test_a_bad_name_is_refused(server: ServerProcess, name: Any) -> None:
-    field_refused(server.client.post(MAPS, json={"name": name}), "name")
-
-
-def test_good_names_may_be_long_and_odd(server: ServerProcess) -> None:
+def test_a_name_has_1_to_100_letters_digits_or_inner_punctuation(server: ServerProcess) -> None:
+    for name in ("", "a b", "a/b", ".a", "-a", "_a", "ä", "a\n", "a" * 101, None):
+        field_refused(server.client.post(MAPS, json={"name": name}), "name")
     for name in ("a" * 100, "0", "A.b_c-d", "maps", "null"):
         got(server.client.post(MAPS, json={"name": name}), 201)
         assert got(server.client.get(f"{MAPS}/{name}"))["name"] == name
@@ -129,19 +123,6 @@ def test_every_call_says_how_to_make_the_map_that_is_missing(server: ServerProce
 # --- each for itself -------------------------------------------------------------------------
 
 
-def test_the_same_bytes_in_two_maps_are_two_photos(server: ServerProcess) -> None:
-    one, other = make(server), make(server)
-    number = next(fresh)
-    (here,) = store(server, one, number, latitude=1, longitude=2)
-    (there,) = store(server, other, number, latitude=3, longitude=4)
-    assert here != there
-    for name, file_id, latitude in ((one, here, 1), (other, there, 3)):
-        photo = got(server.client.get(f"/api/v1/uploads/{file_id}", params={"map": name}))
-        assert photo["latitude"] == latitude
-    got(server.client.delete(f"/api/v1/uploads/{here}", params={"map": one}))
-    assert got(server.client.get(f"/api/v1/uploads/{there}", params={"map": other}))["searchable"]
-
-
 def test_searches_never_cross(server: ServerProcess) -> None:
     one, other = make(server), make(server)
     numbers = [next(fresh) for _ in range(3)]
@@ -161,6 +142,9 @@ def test_searches_never_cross(server: ServerProcess) -> None:
         expected = ",".join([*here, *there])
         answer = got(server.similar(ids[0], map=name, ids=expected))
         assert {found["image_id"] for found in answer["similar_images"]} == set(ids[1:])
+    got(server.client.delete(f"/api/v1/uploads/{here[0]}", params={"map": one}))
+    twin = got(server.client.get(f"/api/v1/uploads/{there[0]}", params={"map": other}))
+    assert twin["searchable"], "the same bytes in two maps are two photos"
 
 
 def test_what_belongs_to_one_map_is_not_found_in_another(server: ServerProcess) -> None:

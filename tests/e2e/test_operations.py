@@ -106,13 +106,6 @@ def test_a_body_that_is_no_json_is_a_problem(server: ServerProcess) -> None:
         problem(answer, 400, "malformed_body")
 
 
-def test_an_extractor_without_a_vocabulary_has_nothing_to_fit(server: ServerProcess) -> None:
-    answer = server.client.post(f"{API}/vocabularies", json={})
-    job = server.finished(answer.json()["job_id"])
-    assert (job["state"], job["error"]["code"]) == ("failed", "vocabulary_unusable")
-    assert "test-tiny-avg" in job["error"]["detail"]
-
-
 # --- starts that are refused -----------------------------------------------------------------
 
 
@@ -145,7 +138,6 @@ def test_an_address_has_one_server(server: ServerProcess, tmp_path: Path) -> Non
     [
         ({"extractor": "anylock-vitg14"}, "bad_setting", "efficientnet-lite0-vlad"),
         ({"allow_test_extractors": False}, "bad_setting", "test-tiny-avg"),
-        ({"dino_model": "dinov2_vitg14"}, "bad_setting", "EXTRACTOR=test-tiny-avg contradicts"),
         ({"port": "http"}, "bad_setting", "PORT"),
     ],
 )

@@ -116,16 +116,11 @@ def test_each_field_can_be_changed_and_null_clears_it(
     ("patch", "named"),
     [
         ({"latitude": 91}, "latitude"),
-        ({"latitude": None}, "latitude"),
         ({"longitude": None}, "longitude"),
-        ({"longitude": 180.1}, "longitude"),
-        ({"heading": 400}, "heading"),
         ({"captured_at": "yesterday"}, "captured_at"),
         ({"place": "a\0b"}, "place"),
-        ({"tags": "a,b"}, "tags"),
         ({"tags": [str(tag) for tag in range(51)]}, "tags"),
         ({"metadata": {"a": "\0"}}, "metadata"),
-        ({"lattitude": 45}, "lattitude"),
         ({"filename": "other.jpg"}, "filename"),
     ],
 )
@@ -201,6 +196,7 @@ def test_unknown_photos_and_maps_are_not_found(server: ServerProcess, file_id: s
         problem(server.client.delete(url(unknown)), 404, "photo_not_found")
         problem(server.client.get(url(unknown, "/image")), 404, "photo_not_found")
         problem(server.client.get(url(unknown, "/thumbnail")), 404, "photo_not_found")
+        problem(server.similar(unknown), 404, "photo_not_found")
     for part in ("", "/image", "/thumbnail"):
         answer = server.client.get(url(file_id, part), params={"map": "nowhere"})
         problem(answer, 404, "map_not_found")
@@ -237,15 +233,6 @@ def streets_named(*numbers: int) -> list[str]:
     return [f"Street_{number}.jpg" for number in numbers]
 
 
-def test_photos_are_found_newest_first_with_all_their_fields(
-    server: ServerProcess, streets: list[dict[str, Any]]
-) -> None:
-    body = got(server.client.get("/api/v1/search", params={"tags": "street"}))
-    only_of_one = ("job_id", "media_type", "sha256", "searchable")
-    expected = [{k: v for k, v in s.items() if k not in only_of_one} for s in streets]
-    assert body["images"] == expected[::-1]
-
-
 def test_photos_are_found_by_each_filter(
     server: ServerProcess, streets: list[dict[str, Any]]
 ) -> None:
@@ -263,21 +250,23 @@ def test_photos_are_found_by_each_filter(
     )
 
 
-def test_found_photos_are_read_page_by_page(
+def test_found_photos_are_read_newest_first_page_by_page_with_all_their_fields(
     server: ServerProcess, streets: list[dict[str, Any]]
 ) -> None:
+    only_of_one = ("job_id", "media_type", "sha256", "searchable")
+    expected = [{k: v for k, v in s.items() if k not in only_of_one} for s in reversed(streets)]
     params: dict[str, Any] = {"tags": "street", "limit": 2}
     sizes, read = [], []
     while True:
         page = got(server.client.get("/api/v1/search", params=params))
         assert page["total_found"] == STREETS
         sizes.append(len(page["images"]))
-        read += [image["image_id"] for image in page["images"]]
+        read += page["images"]
         if page["next_cursor"] is None:
             break
         params["cursor"] = page["next_cursor"]
     assert sizes == [2, 2, 1]
-    assert read == [street["image_id"] for street in reversed(streets)]
+    assert read == expected
 
 
 @pytest.mark.parametrize(
@@ -285,10 +274,7 @@ def test_found_photos_are_read_page_by_page(
     [
         ({"cursor": "bm8gdXVpZA=="}, "cursor"),
         ({"upload_after": "yesterday"}, "upload_after"),
-        ({"upload_before": "2026-02-30"}, "upload_before"),
         ({"min_file_size": "-1"}, "min_file_size"),
-        ({"max_file_size": "large"}, "max_file_size"),
-        ({"limit": "0"}, "limit"),
         ({"limit": "1001"}, "limit"),
         ({"filename": "a\0b"}, "filename"),
     ],

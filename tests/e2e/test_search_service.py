@@ -12,7 +12,6 @@ from typing import Any
 from uuid import UUID
 
 import httpx2
-import pytest
 
 from shared.catalog.chunks import find_descriptor
 from shared.catalog.database.session import Catalog
@@ -23,7 +22,7 @@ from shared.search_api.client import HttpSearchClient
 from shared.search_api.protocol import SearchRequest, SearchResponse
 from tests.support.photos import photo_bytes
 from tests.support.processes import PLACEWISE, Process, start
-from tests.support.server import START_SECONDS, ServerProcess, environment, run_command
+from tests.support.server import START_SECONDS, ServerProcess, environment
 
 # One slot a photo, so that both shards have some.
 SETTINGS = {"slot_rows": 2, "batch_photos": 1}
@@ -112,12 +111,3 @@ def test_two_search_processes_answer_what_the_embedded_one_answers(
         assert first.wait(timeout=30) == 0, (tmp_path / "0.log").read_text()
         assert names(server.home) == ["0/1", "1/2"], "it has signed off"
         assert ask(port, server.home, file_ids[0]).missing == ("shard 0/2",)
-
-
-@pytest.mark.parametrize("shard", ["2/2", "all"])
-def test_an_unusable_shard_is_refused_at_the_start(tmp_path: Path, shard: str) -> None:
-    env = environment(tmp_path / "home", search_shard=shard)
-    ended = run_command("search", env=env, cwd=tmp_path)
-    assert ended.returncode != 0
-    assert "SEARCH_SHARD" in ended.stderr
-    assert "is not a shard" in ended.stderr

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.hub import COMMIT, write_hub
+from tests.support.hub import write_hub
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import field_refused
 from tests.support.server import ServerProcess
@@ -68,22 +68,7 @@ def test_photos_described_by_an_allowed_entry_are_found(
     assert server.client.get(f"{MAPS}/hub").json()["extractor"] == allowed
 
 
-def test_an_entry_has_no_vocabulary_to_fit(server: ServerProcess, allowed: str) -> None:
-    make(server, "nofit", allowed)
-    answer = server.client.post(
-        "/api/v1/upload",
-        params={"map": "nofit"},
-        files={"file": ("photo.jpg", photo_bytes(1))},
-        headers={"Prefer": "wait=30"},
-    )
-    assert answer.status_code == 201, answer.text
-    fit = server.client.post("/api/v1/vocabularies", params={"map": "nofit"})
-    assert fit.status_code == 202, fit.text
-    job = server.client.get(f"{fit.json()['status_url']}&wait=30").json()
-    assert (job["state"], job["error"]["code"]) == ("failed", "vocabulary_unusable")
-
-
-@pytest.mark.parametrize("entry", ["prints", "colours", "colours:dimension=41,input.size=64x64"])
+@pytest.mark.parametrize("entry", ["prints", "colours:dimension=41,input.size=64x64"])
 def test_an_entry_that_is_not_allowed_by_its_exact_name_is_refused(
     server: ServerProcess, folder: Path, entry: str
 ) -> None:
@@ -91,17 +76,6 @@ def test_an_entry_that_is_not_allowed_by_its_exact_name_is_refused(
     answer = server.client.post(MAPS, json=params)
     field_refused(answer, "extractor")
     assert "TORCHHUB_ALLOWED" in answer.json()["detail"]
-
-
-def test_a_repository_that_is_not_pinned_is_refused_with_how_to_pin_it(
-    server: ServerProcess,
-) -> None:
-    params = {"name": "other", "extractor": "torchhub:gmberton/MegaLoc:get_trained_model"}
-    answer = server.client.post(MAPS, json=params)
-    field_refused(answer, "extractor")
-    assert "git ls-remote" in answer.json()["detail"]
-    params["extractor"] = f"torchhub:gmberton/MegaLoc@{COMMIT}:get_trained_model"
-    field_refused(server.client.post(MAPS, json=params), "extractor")
 
 
 def test_an_entry_that_is_no_extractor_keeps_photos_waiting_with_the_reason(

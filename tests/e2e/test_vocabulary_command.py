@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from shared.descriptors.vocabulary_file import VocabularyFile, read_vocabulary
+from shared.descriptors.vocabulary_file import read_vocabulary
 from tests.support.photos import photo_bytes
 from tests.support.server import CommandLine, Run, ServerProcess
 
@@ -130,16 +130,6 @@ def test_a_map_is_reduced_by_one_command_and_whole_again_by_another(folder: Fold
     assert "PCA: 3 of" in run("vocabulary", "list")
     assert "7 photos, 128 dimensions, 0 failed" in run("maps", "switch", "default", "--pca", "0")
     folder.run("maps", "switch", "default", "--pca", "0", "--json").refusal("not_reduced")
-
-
-def test_a_file_of_another_extractor_is_refused_by_the_map(folder: Folder, fitted: Any) -> None:
-    found = read_vocabulary(folder.path / "city.npz")
-    other = VocabularyFile(found.centres, {**found.provenance, "layer": "another"})
-    (folder.path / "other.npz").write_bytes(other.encode())
-    refused = folder.run("vocabulary", "import", "other.npz", "--json")
-    detail = refused.refusal("vocabulary_unusable")
-    assert "layer another" in detail
-    assert "layer projection" in detail
 
 
 @pytest.mark.parametrize(
