@@ -328,7 +328,11 @@ def test_an_event_stream_too_many_is_refused_and_one_that_ended_makes_room(
 
 
 @pytest.mark.usefixtures("always_look")
-def test_health_says_how_full_things_are(make_service: Make, catalog: Catalog) -> None:
+def test_health_says_how_full_things_are(
+    make_service: Make, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    receiving = {UploadKind.UPLOAD: 3, UploadKind.QUERY: 2}
+    monkeypatch.setattr(AdmissionControl, "active_uploads", lambda _, kind: receiving[kind])
     service = make_service(max_queued_jobs=50, max_queued_queries=7)
     with catalog.write() as session:
         city = get_map(session, "city").id
@@ -337,5 +341,5 @@ def test_health_says_how_full_things_are(make_service: Make, catalog: Catalog) -
     load = service.json("GET", "/health")["load"]
     assert (load["waiting_jobs"], load["max_queued_jobs"]) == (1, 50)
     assert (load["waiting_queries"], load["max_queued_queries"]) == (1, 7)
-    assert (load["receiving_uploads"], load["receiving_queries"]) == (0, 0)
+    assert (load["receiving_uploads"], load["receiving_queries"]) == (3, 2)
     assert load["free_bytes"] > 0

@@ -28,7 +28,8 @@ from tests.integration.in_process_api import Service
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import field_refused, problem
 
-# tests/contract/catalog/test_idempotency.py runs the statements on SQLite, too.
+# tests/contract/catalog/test_idempotency.py runs the statements on SQLite, too;
+# tests/faults/test_repeated_calls.py kills gateways.
 pytestmark = pytest.mark.databases("postgresql")
 
 REPLAYED = "idempotent-replayed"
@@ -289,28 +290,6 @@ def test_a_gateway_that_was_slower_than_its_lease_has_no_effect_beside_another_o
     assert second[0].status_code == 202
     assert count(catalog, Job) == jobs + 1
     same(second[0], call_evaluation(service, headers=keyed()))
-
-
-def test_a_gateway_that_crashed_blocks_its_key_no_longer_than_its_lease(
-    service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What a killed process leaves: a claimed key, and nothing after it."""
-    monkeypatch.setattr(idempotency.IdempotentRequest, "release_key", lambda self: None)
-    with monkeypatch.context() as dying:
-        dying.setattr(
-            idempotency.IdempotentRequest,
-            "store_response",
-            lambda *_: (_ for _ in ()).throw(SystemError("killed")),
-        )
-        problem(upload(service, photo_bytes(1)), 500, "internal_error")
-    assert count(catalog, Photo) == 0
-    problem(upload(service, photo_bytes(1)), 409, "idempotency_key_in_use")
-    with catalog.write() as session:
-        session.execute(update(IdempotencyRecord).values(lease_until=db_now_plus(-1)))
-    first = upload(service, photo_bytes(1))
-    assert first.status_code == 202
-    same(first, upload(service, photo_bytes(1)))
-    assert count(catalog, Photo) == 1
 
 
 @pytest.mark.parametrize("make", [call_upload, call_evaluation, call_map], ids=lambda f: f.__name__)

@@ -78,6 +78,7 @@ def test_the_levels_of_a_path_are_listed_finest_first_and_ever_more_probable(
     for field in ("in_map", "answer_level", "not_in_map_probability"):
         assert entry[field] == estimate[field]
     assert ask(tower, 0, "tower")["estimate"]["certainty"] == 0.95
+    assert [level["place"] for level in ask(tower, 5, "tower")["estimate"]["levels"]] == ["a"]
     assert ask(tower, 0, "tower", certainty=1)["estimate"]["answer_level"] is None
 
 
@@ -123,35 +124,6 @@ def test_circles_are_the_levels_of_coordinates(service: Service) -> None:
     assert {(level["latitude"], level["longitude"]) for level in estimate["levels"]} == {
         (45.0, 7.0)
     }
-
-
-def test_labels_of_one_level_are_the_only_level_of_a_map_of_paths(service: Service) -> None:
-    service.json("POST", "/maps", 201, json={"name": "flat", "place_labels_are_paths": True})
-    for number in range(3):
-        service.upload(photo_bytes(number), "flat", place=f"room {number}")
-    service.drain()
-    fit(service, "flat")
-    assert [e["place"] for e in ask(service, 1, "flat")["estimate"]["levels"]] == ["room 1"]
-
-
-@pytest.mark.parametrize("labels_are_paths", [False, True])
-def test_a_label_that_disagrees_with_the_coordinates_decides_in_maps_of_paths_only(
-    service: Service, labels_are_paths: bool
-) -> None:
-    body = {"name": "torn", "place_labels_are_paths": labels_are_paths}
-    service.json("POST", "/maps", 201, json=body)
-    for number, latitude in enumerate((45.0, 46.0, 45.0)):
-        place = ("tower/7", "tower/7", "tower/8")[number]
-        service.upload(photo_bytes(number), "torn", latitude=latitude, longitude=7.0, place=place)
-    service.drain()
-    fit(service, "torn")
-    estimate = ask(service, 1, "torn")["estimate"]
-    levels = estimate["levels"]
-    if labels_are_paths:
-        assert [level["place"] for level in levels] == ["tower/7", "tower"]
-    else:
-        assert {(level["latitude"], level["longitude"]) for level in levels} == {(46.0, 7.0)}
-    assert (estimate["place"], estimate["latitude"]) == ("tower/7", 46.0)
 
 
 def test_a_photo_without_a_location_has_no_levels(service: Service) -> None:
