@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import itertools
 import json
 import threading
@@ -14,7 +13,7 @@ from uuid import uuid4
 import httpx2
 import pytest
 
-from tests.support.photos import photo_bytes, photo_image
+from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 from tests.support.server import ServerProcess
 
@@ -22,13 +21,6 @@ from tests.support.server import ServerProcess
 SETTINGS = {"batch_photos": 1}
 JOBS = "/api/v1/jobs"
 fresh = itertools.count(2000)
-
-
-def undecodable() -> bytes:
-    """A JPEG whose header is fine and whose pixels end too early."""
-    buffer = io.BytesIO()
-    photo_image(next(fresh), 640, 480).save(buffer, "JPEG", quality=95)
-    return buffer.getvalue()[: len(buffer.getvalue()) // 2]
 
 
 def get(server: ServerProcess, path: str, **params: Any) -> dict[str, Any]:
@@ -44,7 +36,7 @@ def listed(server: ServerProcess, **params: Any) -> list[dict[str, Any]]:
 
 
 def failed_job(server: ServerProcess) -> str:
-    job_id: str = server.upload(undecodable()).json()["job_id"]
+    job_id: str = server.upload(photo_bytes(next(fresh))[:-60]).json()["job_id"]
     assert server.finished(job_id)["state"] == "failed"
     return job_id
 

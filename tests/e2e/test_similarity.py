@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -11,7 +10,7 @@ from uuid import uuid4
 import httpx2
 import pytest
 
-from tests.support.photos import photo_bytes, photo_image
+from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 from tests.support.server import ServerProcess
 
@@ -85,13 +84,6 @@ def stats(server: ServerProcess) -> dict[str, Any]:
     return answered(server.client.get("/api/v1/database/stats"))
 
 
-def undecodable() -> bytes:
-    """A JPEG whose header is fine and whose pixels end too early."""
-    buffer = io.BytesIO()
-    photo_image(next(fresh), 640, 480).save(buffer, "JPEG", quality=95)
-    return buffer.getvalue()[: len(buffer.getvalue()) // 2]
-
-
 def test_a_near_copy_finds_its_place_first(server: ServerProcess, places: list[str]) -> None:
     for number, place in enumerate(places, start=1):
         body = answered(server.ask(photo_bytes(number), top_k=3))
@@ -148,7 +140,7 @@ def test_a_bad_parameter_is_refused_by_name(server: ServerProcess, places: list[
 
 
 def test_a_query_photo_that_can_not_be_decoded_is_refused(server: ServerProcess) -> None:
-    problem(server.ask(undecodable()), 422, "undecodable_photo")
+    problem(server.ask(photo_bytes(next(fresh))[:-60]), 422, "undecodable_photo")
 
 
 def test_a_photo_that_is_not_described_yet_says_what_to_wait_for(server: ServerProcess) -> None:
@@ -164,7 +156,7 @@ def test_a_photo_that_is_not_described_yet_says_what_to_wait_for(server: ServerP
 
 
 def test_a_photo_that_could_not_be_described_says_why(server: ServerProcess) -> None:
-    uploaded = server.upload(undecodable()).json()
+    uploaded = server.upload(photo_bytes(next(fresh))[:-60]).json()
     failed = server.finished(uploaded["job_id"])
     body = problem(server.similar(uploaded["file_id"]), 409, "not_searchable")
     assert (body["job_id"], body["state"]) == (uploaded["job_id"], "failed")
