@@ -67,17 +67,6 @@ def test_probes_may_ask_for_the_head_alone(server: ServerProcess) -> None:
         assert (answer.status_code, answer.content) == (200, b""), path
 
 
-def test_the_answer_to_a_waiting_upload_says_how_it_ended(server: ServerProcess) -> None:
-    wait = {"Prefer": "wait=30"}
-    for data, status, word in (
-        (photo_bytes(8), "succeeded", "searchable"),
-        (photo_bytes(9)[:-50], "failed", "can't be decoded"),
-    ):
-        answer = server.client.post("/api/v1/upload", files={"file": data}, headers=wait).json()
-        assert answer["status"] == status
-        assert word in answer["message"]
-
-
 def test_doctor_writes_nothing(tmp_path: Path) -> None:
     from services.cli.operations.installation_checks import _check_catalog_file, _check_home
     from shared.config.settings import Settings

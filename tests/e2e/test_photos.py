@@ -150,17 +150,6 @@ def test_an_image_is_the_bytes_that_were_uploaded(server: ServerProcess) -> None
     assert (other.status_code, other.content) == (200, data)
 
 
-def test_a_photo_that_is_not_described_has_its_image_and_no_thumbnail(
-    server: ServerProcess,
-) -> None:
-    data = photo_bytes(next(fresh))
-    with server.no_decoding():
-        uploaded = server.upload(data).json()["file_id"]
-        assert not got(server.client.get(url(uploaded)))["searchable"]
-        assert server.client.get(url(uploaded, "/image")).content == data
-        problem(server.client.get(url(uploaded, "/thumbnail")), 404, "thumbnail_not_found")
-
-
 def test_a_deleted_photo_is_gone_from_every_call(server: ServerProcess) -> None:
     data = photo_bytes(next(fresh))
     gone = server.indexed(data, "gone.jpg")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,48 +11,42 @@ import pytest
 from tests.support.checkpoints import own_output, untrained, write_checkpoint
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
-from tests.support.server import ServerProcess, environment, run_command
+from tests.support.server import CommandLine, ServerProcess
 
 PHOTOS = 4
 
 
-class Commands:
+class Commands(CommandLine):
     """`placewise` beside the server, whose answers are JSON."""
 
-    def __init__(self, server: ServerProcess, folder: Path) -> None:
-        self._environment = environment(server.home)
-        self._folder = folder
-
-    def __call__(self, *arguments: str | Path) -> Any:
-        ended = run_command(*arguments, "--json", env=self._environment, cwd=self._folder)
-        assert ended.returncode == 0, ended.stderr + ended.stdout
-        return json.loads(ended.stdout)
+    def json(self, *arguments: str | Path) -> Any:
+        return self(*arguments, "--json").json()
 
     def refused(self, *arguments: str | Path) -> str:
         """The line on stderr of a command that ends with 1."""
-        ended = run_command(*arguments, env=self._environment, cwd=self._folder)
-        assert ended.returncode == 1, ended.stdout
-        return ended.stderr
+        run = self(*arguments)
+        assert run.code == 1, run.stdout
+        return run.stderr
 
 
 @pytest.fixture
 def placewise(server: ServerProcess, tmp_path: Path) -> Commands:
-    return Commands(server, tmp_path)
+    return Commands(tmp_path, server.home)
 
 
 def test_a_trained_model_describes_a_map_answers_and_makes_room_again(
     server: ServerProcess, placewise: Commands, tmp_path: Path
 ) -> None:
     checkpoint = write_checkpoint(tmp_path / "best.ckpt")
-    added = placewise("models", "add", checkpoint, "--name", "walks", "--licence", "CC BY 4.0")
+    added = placewise.json("models", "add", checkpoint, "--name", "walks", "--licence", "CC BY 4.0")
     assert added["result"]["extractor"] == "gsv:walks"
-    (listed,) = placewise("models", "added")
+    (listed,) = placewise.json("models", "added")
     assert (listed["name"], listed["licence"], listed["maps"]) == ("walks", "CC BY 4.0", [])
 
     for number in range(1, PHOTOS):  # beside the one that the server has
         server.indexed(photo_bytes(number), f"{number}.jpg")
     before = server.client.get("/api/v1/maps/default").json()
-    switched = placewise("maps", "switch", "default", "--extractor", "gsv:walks")
+    switched = placewise.json("maps", "switch", "default", "--extractor", "gsv:walks")
     assert (switched["result"]["dimension"], switched["result"]["failed"]) == (128, 0)
 
     answer = server.ask(near_copy(2), top_k=PHOTOS)
@@ -66,24 +59,24 @@ def test_a_trained_model_describes_a_map_answers_and_makes_room_again(
     assert problem(used, 409, "model_in_use")["maps"] == ["default"]
     assert "model_in_use" in placewise.refused("models", "remove", "walks")
 
-    back = placewise("maps", "switch", "default", "--extractor", before["extractor"])
+    back = placewise.json("maps", "switch", "default", "--extractor", before["extractor"])
     assert back["result"]["dimension"] == before["dimension"]
     assert server.ask(near_copy(2)).json()["similar_images"][0]["original_filename"] == "2.jpg"
-    assert placewise("models", "remove", "walks")["removed_model"] == "walks"
-    assert placewise("models", "added") == []
+    assert placewise.json("models", "remove", "walks")["removed_model"] == "walks"
+    assert placewise.json("models", "added") == []
 
 
 def test_describe_makes_of_a_file_and_of_an_added_model_what_the_model_itself_makes(
     placewise: Commands, tmp_path: Path
 ) -> None:
     checkpoint = write_checkpoint(tmp_path / "best.ckpt")
-    placewise("models", "add", checkpoint, "--name", "described")
+    placewise.json("models", "add", checkpoint, "--name", "described")
     photo = tmp_path / "street.jpg"
     photo.write_bytes(photo_bytes(7))
     specs = []
     for name in (f"gsv:{checkpoint}", "gsv:described"):
         out = tmp_path / "rows.npy"
-        specs.append(placewise("describe", photo, "--extractor", name, "--out", out)["spec"])
+        specs.append(placewise.json("describe", photo, "--extractor", name, "--out", out)["spec"])
         (row,) = np.load(out)
         assert np.allclose(row, own_output(untrained(), photo_bytes(7)), atol=1e-5)
         assert specs[-1].pop("extractor") == name

@@ -101,7 +101,7 @@ def test_an_upload_is_acknowledged_with_a_job_to_poll(server: ServerProcess) -> 
     assert server.client.get(body["status_url"]).json()["file_id"] == body["file_id"]
 
 
-def test_an_upload_that_prefers_to_wait_is_answered_once_it_is_searchable(
+def test_an_upload_that_prefers_to_wait_is_answered_once_it_is_searchable_or_has_failed(
     server: ServerProcess,
 ) -> None:
     answer = server.client.post(
@@ -112,10 +112,18 @@ def test_an_upload_that_prefers_to_wait_is_answered_once_it_is_searchable(
     assert answer.json()["status"] == "succeeded"
     assert answer.headers["preference-applied"] == "wait=20"
     assert "retry-after" not in answer.headers
+    assert "searchable" in answer.json()["message"]
     assert photo(server, answer.json()["file_id"])["searchable"]
 
+    broken = {"file": ("broken.jpg", photo_bytes(3)[:-60])}
+    failed = server.client.post(UPLOAD, files=broken, headers={"Prefer": "wait=20"}).json()
+    assert failed["status"] == "failed"
+    assert "can't be decoded" in failed["message"]
 
-def test_the_same_bytes_again_are_the_same_photo(server: ServerProcess) -> None:
+
+def test_the_same_bytes_again_are_the_same_photo_and_elsewhere_they_are_refused(
+    server: ServerProcess,
+) -> None:
     first = server.indexed(photo_bytes(4), "one.jpg", latitude=45.0, longitude=7.0, place="yard")
     before = stored(server)
     for fields in ({}, {"latitude": 45.0, "longitude": 7.0, "place": "yard"}):
@@ -126,6 +134,13 @@ def test_the_same_bytes_again_are_the_same_photo(server: ServerProcess) -> None:
         assert answer.json()["already_there"] is True
         assert answer.json()["filename"] == "one.jpg"
         assert answer.json()["status"] == "succeeded"
+    elsewhere: list[dict[str, Any]] = [{"latitude": 45.001, "longitude": 7.0}, {"place": "kitchen"}]
+    for fields in elsewhere:
+        body = problem(server.upload(photo_bytes(4), **fields), 409, "photo_differs")
+        assert body["file_id"] == first
+        assert f"PATCH /api/v1/uploads/{first}" in body["detail"]
+    found = photo(server, first)
+    assert (found["latitude"], found["place"]) == (45.0, "yard")
     assert stored(server) == before
 
 
@@ -155,19 +170,6 @@ def test_the_same_bytes_again_are_a_202_until_the_photo_is_searchable(
         )
     assert server.finished(first.json()["job_id"])["state"] == "succeeded"
     assert server.upload(data).status_code == 200
-
-
-def test_the_same_bytes_elsewhere_are_refused_and_patch_is_named(server: ServerProcess) -> None:
-    first = server.indexed(photo_bytes(6), latitude=45.0, longitude=7.0, place="hall")
-    before = stored(server)
-    elsewhere: list[dict[str, Any]] = [{"latitude": 45.001, "longitude": 7.0}, {"place": "kitchen"}]
-    for fields in elsewhere:
-        body = problem(server.upload(photo_bytes(6), **fields), 409, "photo_differs")
-        assert body["file_id"] == first
-        assert f"PATCH /api/v1/uploads/{first}" in body["detail"]
-    found = photo(server, first)
-    assert (found["latitude"], found["place"]) == (45.0, "hall")
-    assert stored(server) == before
 
 
 def test_exif_fills_what_the_form_leaves_out(server: ServerProcess) -> None:

@@ -98,7 +98,6 @@ def call_import(service: Service, **options: Any) -> httpx2.Response:
 
 CALLS: dict[str, tuple[int, Callable[..., httpx2.Response]]] = {
     "maps": (201, call_map),
-    "upload": (202, call_upload),
     "similarity": (202, call_query),
     "vocabularies": (202, call_fit),
     "import": (202, call_import),

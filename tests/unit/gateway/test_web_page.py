@@ -123,28 +123,22 @@ def test_the_tile_server_alone_is_added_to_what_may_be_loaded(
     assert (body["map_tiles"], body["map_attribution"]) == (TILES, "© somebody")
 
 
-@pytest.mark.parametrize(
-    "tiles",
-    [
+def test_tiles_need_an_attribution_and_an_address_of_a_server_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("MAP_TILES", TILES)
+    with pytest.raises(ValidationError, match="MAP_ATTRIBUTION"):
+        Settings()
+    monkeypatch.setenv("MAP_ATTRIBUTION", "© somebody")
+    for tiles in (
         "tiles.example.org/{z}/{x}/{y}.png",
         "https://tiles.example.org/",
         "https://tiles.example.org; script-src */{z}/{x}/{y}.png",
         "javascript:alert({z}{x}{y})",
-    ],
-)
-def test_what_is_no_address_of_tiles_is_refused(
-    monkeypatch: pytest.MonkeyPatch, tiles: str
-) -> None:
-    monkeypatch.setenv("MAP_TILES", tiles)
-    monkeypatch.setenv("MAP_ATTRIBUTION", "© somebody")
-    with pytest.raises(ValidationError, match="is not a URL template"):
-        Settings()
-
-
-def test_tiles_without_attribution_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MAP_TILES", TILES)
-    with pytest.raises(ValidationError, match="MAP_ATTRIBUTION"):
-        Settings()
+    ):
+        monkeypatch.setenv("MAP_TILES", tiles)
+        with pytest.raises(ValidationError, match="is not a URL template"):
+            Settings()
 
 
 @pytest.mark.parametrize("path", [path for path in SOURCES if path.suffix == ".html"])
