@@ -1,4 +1,4 @@
-"""HostileFile and malformed files, the same on every run, each with its allowed outcomes."""
+"""Hostile and malformed files, the same on every run, each with its allowed outcomes."""
 
 from __future__ import annotations
 
@@ -45,31 +45,18 @@ def photo(number: int, media: str = "JPEG") -> bytes:
 def of_another_kind() -> Iterator[HostileFile]:
     kinds = {
         "gif": b"GIF89a" + bytes(100),
-        "pdf": b"%PDF-1.7\n1 0 obj\n",
         "html": b"<!doctype html><script>alert(1)</script>",
-        "svg": b"<svg xmlns='http://www.w3.org/2000/svg' onload='alert(1)'/>",
         "svg that includes a file": b"<!DOCTYPE s [<!ENTITY x SYSTEM 'file:///etc/passwd'>]><s>&x;</s>",
         "program": b"\x7fELF\x02\x01\x01" + bytes(100),
-        "windows program": b"MZ\x90\x00" + bytes(100),
-        "java class": b"\xca\xfe\xba\xbe" + bytes(100),
-        "web assembly": b"\0asm\x01\0\0\0" + bytes(100),
-        "shell script": b"#!/bin/sh\nrm -rf /\n",
-        "php": b"<?php system($_GET['c']); ?>",
         "postscript": b"%!PS-Adobe-3.0 EPSF-3.0\n(/etc/passwd) (r) file\n",
         "image magick": b"push graphic-context\nfill 'url(https://127.0.0.1/|id)'\n",
         "zip": zip_of({"a.jpg": photo(0)}),
         "gzip": gzip.compress(photo(0)),
-        "7z": b"7z\xbc\xaf\x27\x1c" + bytes(100),
-        "rar": b"Rar!\x1a\x07\x01\x00" + bytes(100),
-        "sqlite": b"SQLite format 3\0" + bytes(100),
         "mp4": b"\0\0\0\x20ftypisom" + bytes(100),
         "avif": b"\0\0\0\x20ftypavif" + bytes(100),
-        "psd": b"8BPS\0\x01" + bytes(100),
-        "icon": b"\0\0\x01\0\x01\0" + bytes(100),
         "text that begins like a bitmap": b"BMost of this is text, and no picture.",
         "one byte": b"\xff",
         "zeros": bytes(1000),
-        "blanks": b" " * 1000,
     }
     for kind, data in kinds.items():
         yield HostileFile(f"{kind} called a photo", data, NO_PHOTO)
@@ -263,15 +250,11 @@ def names() -> Iterator[HostileFile]:
         "..\\..\\windows\\system32\\photo.jpg",
         "/etc/cron.d/photo.jpg",
         "C:\\photo.jpg",
-        "....//....//photo.jpg",
         "%2e%2e%2fphoto.jpg",
         "photo.jpg\r\nX-Evil: 1",
         "photo\u202egpj.exe",
         "<img src=x onerror=alert(1)>.jpg",
         "'; DROP TABLE photos; --.jpg",
-        "CON.jpg",
-        "-rf.jpg",
-        "$(id).jpg",
         "{{7*7}}.jpg",
     )
     for number, name in enumerate(names):

@@ -16,23 +16,6 @@ AUTOMATIC = 64  # located photos from which a map is evaluated by itself
 SETTINGS = {"auto_evaluate_photos": AUTOMATIC}
 ENOUGH = 60  # to tell one in twenty, and not evaluated by itself
 MANY = 60  # more than an estimate looks at
-ESTIMATE_FIELDS = {
-    "in_map",
-    "latitude",
-    "longitude",
-    "radius_m",
-    "place",
-    "has_place",
-    "confidence",
-    "reason",
-    "certainty",
-    "levels",
-    "answer_level",
-    "not_in_map_probability",
-    "radius_68_m",
-    "radius_95_m",
-    "calibration_source",
-}
 fresh = itertools.count(9000)
 
 
@@ -63,7 +46,6 @@ def fill(server: ServerProcess, name: str, numbers: list[int], *about: dict[str,
 
 def ask(server: ServerProcess, name: str, data: bytes, **params: Any) -> dict[str, Any]:
     answer: dict[str, Any] = got(server.ask(data, map=name, **params))
-    assert set(answer["estimate"]) == ESTIMATE_FIELDS
     assert answer["estimate"]["reason"]
     assert answer["total_similar"] == len(answer["similar_images"])
     return answer

@@ -57,7 +57,7 @@ def test_each_hostile_file_is_refused_or_handled_and_the_service_goes_on(
     server: ServerProcess,
 ) -> None:
     files = corpus()
-    assert len(files) >= 168
+    assert len(files) >= 156
     assert len({one.name for one in files}) == len(files)
     around = {path.name for path in server.home.parent.iterdir()}
     before = most = memory_of(server)

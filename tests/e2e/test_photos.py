@@ -178,7 +178,7 @@ def test_a_deleted_photo_is_gone_from_every_call(server: ServerProcess) -> None:
     assert server.client.get(url(again, "/image")).content == data
 
 
-def test_unknown_photos_and_maps_are_not_found(server: ServerProcess, file_id: str) -> None:
+def test_unknown_photos_are_not_found(server: ServerProcess) -> None:
     for unknown in (str(uuid4()), "no-id-at-all"):
         problem(server.client.get(url(unknown)), 404, "photo_not_found")
         problem(server.client.patch(url(unknown), json={}), 404, "photo_not_found")
@@ -186,9 +186,6 @@ def test_unknown_photos_and_maps_are_not_found(server: ServerProcess, file_id: s
         problem(server.client.get(url(unknown, "/image")), 404, "photo_not_found")
         problem(server.client.get(url(unknown, "/thumbnail")), 404, "photo_not_found")
         problem(server.similar(unknown), 404, "photo_not_found")
-    for part in ("", "/image", "/thumbnail"):
-        answer = server.client.get(url(file_id, part), params={"map": "nowhere"})
-        problem(answer, 404, "map_not_found")
 
 
 # --- photos by what is known of them ---------------------------------------------------------
