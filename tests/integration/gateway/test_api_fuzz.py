@@ -111,7 +111,7 @@ def each_call(
     assert not failures, "\n\n".join(failures)
 
 
-def test_whoever_has_the_key_gets_what_is_described_and_no_fault(fuzzed: Door) -> None:
+def test_every_call_with_a_key_conforms_to_its_openapi_description(fuzzed: Door) -> None:
     def check(case: Any) -> None:
         case.call_and_validate(headers=KEY, checks=PROMISED)
 
@@ -131,7 +131,9 @@ def followed(door: Door) -> dict[str, str]:
     return {"track_id": track["track_id"], "frame_id": frame["frame_id"]}
 
 
-def test_calls_about_what_is_there_get_what_is_described(fuzzed: Door) -> None:
+def test_calls_about_stored_photos_jobs_and_tracks_conform_to_their_description(
+    fuzzed: Door,
+) -> None:
     def check(case: Any) -> None:
         there = fuzzed.put(ADMIN, 1).json()  # the same one again, unless a call has deleted it
         if "track_id" in case.path_parameters:
@@ -149,7 +151,7 @@ def test_calls_about_what_is_there_get_what_is_described(fuzzed: Door) -> None:
     each_call(fuzzed, check, EXAMPLES, is_about_one)
 
 
-def test_without_a_key_nothing_but_what_is_open_is_answered(fuzzed: Door) -> None:
+def test_every_call_of_the_api_without_a_known_key_is_refused(fuzzed: Door) -> None:
     def check(case: Any) -> None:
         made_up = dict(case.headers or {}).items()
         others = {name: value for name, value in made_up if name.lower() != "authorization"}
@@ -164,7 +166,7 @@ def test_without_a_key_nothing_but_what_is_open_is_answered(fuzzed: Door) -> Non
     each_call(fuzzed, check, 1)
 
 
-def test_calls_that_follow_from_one_another_get_what_is_described(fuzzed: Door) -> None:
+def test_sequences_of_linked_calls_conform_to_their_description(fuzzed: Door) -> None:
     machine = described(fuzzed).as_state_machine()
 
     class Sequences(machine):  # type: ignore[misc, valid-type]
@@ -179,7 +181,7 @@ def test_calls_that_follow_from_one_another_get_what_is_described(fuzzed: Door) 
     assert fuzzed(ADMIN, "GET", "/health").status_code == 200
 
 
-def test_the_fuzz_would_find_a_fault(fuzzed: Door, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_fuzz_reports_a_server_error(fuzzed: Door, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*args: Any) -> Any:
         raise ZeroDivisionError
 

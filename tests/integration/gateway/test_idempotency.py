@@ -131,7 +131,7 @@ def test_cancelling_and_retrying_can_be_repeated(service: Service, what: str) ->
     same(first, service("POST", f"/jobs/{job}/{what}", headers=keyed()))
 
 
-def test_without_a_key_every_call_is_a_call(service: Service, catalog: Catalog) -> None:
+def test_calls_without_a_key_are_each_carried_out(service: Service, catalog: Catalog) -> None:
     service.indexed(1, latitude=45, longitude=7)
     jobs = {call_evaluation(service).json()["job_id"] for _ in range(2)}
     assert len(jobs) == 2
@@ -201,7 +201,7 @@ def test_an_upload_that_waited_is_answered_the_same(service: Service) -> None:
     assert again.json()["status"] == "succeeded"
 
 
-def test_a_refusal_is_kept_and_leaves_nothing(service: Service, store: FolderStore) -> None:
+def test_a_refusal_is_replayed_and_stores_no_original(service: Service, store: FolderStore) -> None:
     broken = b"\xff\xd8\xff" + bytes(5000)
     first = upload(service, broken)
     problem(first, 422, "undecodable_photo")
@@ -214,13 +214,13 @@ def test_a_refusal_is_kept_and_leaves_nothing(service: Service, store: FolderSto
     same(refused, call_map(service, headers=keyed("again")))
 
 
-def test_a_body_that_can_not_be_understood_keeps_no_key(service: Service, catalog: Catalog) -> None:
+def test_an_invalid_body_stores_no_key(service: Service, catalog: Catalog) -> None:
     field_refused(service("POST", "/maps", json={"name": "a/b"}, headers=keyed()), "name")
     assert count(catalog, IdempotencyRecord) == 0
     assert call_map(service, headers=keyed()).status_code == 201
 
 
-def test_a_failure_of_ours_is_not_kept(
+def test_a_server_error_is_not_stored_under_the_key(
     service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def away(*_: object) -> None:

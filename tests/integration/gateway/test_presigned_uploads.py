@@ -191,7 +191,7 @@ def test_completing_again_gives_the_same_answer_whatever_was_sent_since(
     ],
     ids=["longer", "shorter", "other bytes"],
 )
-def test_other_bytes_than_announced_are_refused_and_may_be_sent_again(
+def test_bytes_that_differ_from_the_announced_ones_are_refused_and_may_be_sent_again(
     service: Service, store: S3Store, catalog: Catalog, sent: bytes, code: str
 ) -> None:
     upload = presign(service)
@@ -241,7 +241,9 @@ def test_what_is_no_photo_is_refused_and_leaves_no_original(
     assert (photos(catalog), keys(store, "originals/")) == (0, set())
 
 
-def test_bytes_that_the_map_has_are_the_photo_that_it_has(service: Service, store: S3Store) -> None:
+def test_bytes_that_are_already_stored_are_answered_with_their_photo(
+    service: Service, store: S3Store
+) -> None:
     there = service.upload(PHOTO, latitude=45, longitude=7)
     service.drain()
     upload = presign(service)
@@ -256,7 +258,7 @@ def test_bytes_that_the_map_has_are_the_photo_that_it_has(service: Service, stor
     assert len(keys(store, "originals/")) == 1
 
 
-def test_what_was_not_completed_in_time_is_gone_and_collected(
+def test_an_expired_upload_is_refused_and_its_bytes_are_collected(
     service: Service, store: S3Store, catalog: Catalog
 ) -> None:
     upload, retained = presign(service), presign(service, photo_bytes(2))
@@ -348,7 +350,7 @@ def test_an_unknown_upload_is_not_found(service: Service) -> None:
         problem(answer, 404, "upload_not_found")
 
 
-def test_a_folder_says_how_photos_come_in(
+def test_a_folder_store_refuses_direct_uploads_and_names_the_upload_route(
     catalog: Catalog,
     settings: Settings,
     make_worker: Callable[[], ExtractorWorker],

@@ -89,7 +89,7 @@ def test_an_unhandled_error_returns_an_id_and_nothing_of_the_code(
     assert "/srv/secret/place.py" in caplog.text
 
 
-def test_no_page_of_elsewhere_may_read_answers(client: TestClient) -> None:
+def test_pages_of_other_origins_may_not_read_answers(client: TestClient) -> None:
     preflight = client.options(
         "/api/v1/jobs", headers={"Origin": MAPS, "Access-Control-Request-Method": "GET"}
     )
@@ -99,7 +99,7 @@ def test_no_page_of_elsewhere_may_read_answers(client: TestClient) -> None:
     problem(client.get("/api/v1/jobs", headers={"Origin": MAPS}), 403, "foreign_page")
 
 
-def test_a_page_that_is_trusted_may(
+def test_a_page_of_a_trusted_origin_may_call_and_read_answers(
     catalog: Catalog, store: FolderStore, settings: Settings
 ) -> None:
     open_to = settings.model_copy(update={"cors_origins": f"{MAPS}, https://other.example"})
