@@ -17,7 +17,7 @@ from shared.errors import InvalidRequest
 from tests.e2e.test_separate_services import Deployment, until
 from tests.support.archives import zip_of
 from tests.support.photos import photo_bytes
-from tests.support.server import ServerProcess, environment, run_command
+from tests.support.server import CommandLine, ServerProcess
 from tests.support.servers import PostgresServer, S3Server, start_redis
 
 SETTINGS = {"max_file_size": 100_000}
@@ -91,10 +91,8 @@ def test_a_manifest_of_more_than_a_megabyte_is_read(server: ServerProcess) -> No
 
 
 def index(server: ServerProcess, path: Path, *options: str, code: int = 0) -> dict[str, Any]:
-    env = environment(server.home)
-    ended = run_command("index", path, *options, "--json", env=env, cwd=path.parent)
-    assert ended.returncode == code, ended.stdout + ended.stderr
-    report: dict[str, Any] = json.loads(ended.stdout)
+    run = CommandLine(path.parent, server.home)("index", path, *options, "--json")
+    report: dict[str, Any] = run.json(code)
     return report
 
 
@@ -167,10 +165,8 @@ def test_export_writes_what_other_programs_read(server: ServerProcess, tmp_path:
     server.finished(uploaded["job_id"])
 
     def export(*arguments: str) -> dict[str, Any]:
-        env = environment(server.home)
-        ended = run_command("export", *arguments, "--json", env=env, cwd=tmp_path)
-        assert ended.returncode == 0, ended.stdout + ended.stderr
-        written: dict[str, Any] = json.loads(ended.stdout)
+        run = CommandLine(tmp_path, server.home)("export", *arguments, "--json")
+        written: dict[str, Any] = run.json()
         return written
 
     rows = export("descriptors", "--out", str(tmp_path / "rows"))
