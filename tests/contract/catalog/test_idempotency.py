@@ -56,8 +56,10 @@ def expire(catalog: Catalog) -> None:
         session.execute(update(IdempotencyRecord).values(expires_at=db_now_plus(-1)))
 
 
-def test_a_stored_response_is_replayed_unchanged(catalog: Catalog) -> None:
+def test_a_stored_response_is_replayed_unchanged_to_its_scope_and_key(catalog: Catalog) -> None:
     keep(catalog, token(catalog))
+    token(catalog, replace(CALL, scope="someone else"))
+    token(catalog, replace(CALL, key="key-2"))
     assert claim(catalog) == ANSWER
     assert claim(catalog) == ANSWER
 
@@ -85,12 +87,6 @@ def test_another_call_under_the_key_is_refused(
         assert claim(catalog) == ANSWER
 
 
-def test_another_scope_or_key_is_another_call(catalog: Catalog) -> None:
-    keep(catalog, token(catalog))
-    token(catalog, replace(CALL, scope="someone else"))
-    token(catalog, replace(CALL, key="key-2"))
-
-
 def test_a_dead_callers_key_is_taken_over_and_it_can_commit_no_more(catalog: Catalog) -> None:
     dead = token(catalog, lease_seconds=-1)
     living = token(catalog)
@@ -102,14 +98,12 @@ def test_a_dead_callers_key_is_taken_over_and_it_can_commit_no_more(catalog: Cat
     assert claim(catalog) == ANSWER
 
 
-def test_a_slow_caller_that_no_one_replaced_commits(catalog: Catalog) -> None:
-    keep(catalog, token(catalog, lease_seconds=-1))
-    assert claim(catalog) == ANSWER
-
-
-def test_an_answer_outlives_the_lease_and_can_be_replaced_by_its_caller(catalog: Catalog) -> None:
+def test_a_slow_caller_that_no_one_replaced_commits_and_may_replace_its_answer(
+    catalog: Catalog,
+) -> None:
     held = token(catalog, lease_seconds=-1)
     keep(catalog, held)
+    assert claim(catalog) == ANSWER
     later = StoredResponse(200, {}, '{"state":"done"}')
     keep(catalog, held, later)
     assert claim(catalog) == later

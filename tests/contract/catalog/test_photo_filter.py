@@ -8,12 +8,12 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as some
 from sqlalchemy import delete, select
 
-from services.gateway.photo_search import MetadataFilter, filter_conditions, search_photos
+from services.gateway.photo_search import filter_conditions
 from services.search.photo_columns import PhotoColumns, build_row_mask
 from shared.catalog.database.session import Catalog
 from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole
 from shared.search_api.photo_filter import Box, Circle, PhotoFilter
-from tests.support.catalog_rows import add_map, add_photo
+from tests.support.catalog_rows import add_photo
 from tests.unit.search.photo_filters import HALF_EARTH_M, IDS, passes, photo_facts, photo_filters
 
 FILTERS = 25  # for each population of photos
@@ -90,30 +90,3 @@ def test_coordinates_too_small_for_a_double_spoil_no_search(catalog: Catalog, ma
         larger = circle.model_copy(update={"radius_m": HALF_EARTH_M})
         assert in_sql(catalog, PhotoFilter(near=larger)) == {odd, far}
     assert in_sql(catalog, PhotoFilter(box=Box(south=0, west=0, north=0, east=tiny))) == {odd}
-
-
-def test_filters_narrow_the_metadata_search_of_one_map_and_role(
-    catalog: Catalog, map_id: UUID
-) -> None:
-    here = {"latitude": 45.07, "longitude": 7.69, "place": "hall"}
-    with catalog.write() as session:
-        other = add_map(session, "other").id
-        right = add_photo(session, map_id, **here).id
-        asking = add_photo(session, map_id, role=PhotoRole.QUERY, **here).id
-        add_photo(session, map_id, latitude=45.08, longitude=7.69, place="hall")
-        add_photo(session, map_id, latitude=45.07, longitude=7.69)
-        add_photo(session, other, **here)
-    about = PhotoFilter(
-        place="hall", near=Circle(latitude=45.0701, longitude=7.69, radius_m=100), tags=()
-    )
-    for role, expected in (
-        (PhotoRole.DATABASE, {right}),
-        (PhotoRole.QUERY, {asking}),
-        (None, {right, asking}),
-    ):
-        with catalog.read() as session:
-            page, total = search_photos(
-                session, map_id, MetadataFilter(photos=about, role=role), 10, None
-            )
-        assert {photo.id for photo in page} == expected
-        assert total == len(expected)
