@@ -116,22 +116,17 @@ def test_jobs_that_are_as_much_work_as_a_batch_come_alone(catalog: Catalog, map_
 
 def test_a_job_that_waits_for_something_is_held_back(catalog: Catalog, map_id: UUID) -> None:
     waiting = queue(catalog, map_id, 2, waiting_for=WaitingFor.VOCABULARY)
+    with catalog.write() as session:
+        other = add_map(session, "other").id
+    queue(catalog, other, waiting_for=WaitingFor.VOCABULARY)
+    queue(catalog, map_id, kind=JobKind.FIT, waiting_for=WaitingFor.DESCRIPTORS)
     ready = queue(catalog, map_id)
     assert ids(take(catalog)) == ready
     assert take(catalog) == []
     with catalog.write() as session:
         wake_vocabulary_waiters(session, map_id)
     assert ids(take(catalog)) == waiting
-
-
-def test_waiters_of_another_map_and_for_something_else_stay(catalog: Catalog, map_id: UUID) -> None:
-    with catalog.write() as session:
-        other = add_map(session, "other").id
-    queue(catalog, other, waiting_for=WaitingFor.VOCABULARY)
-    queue(catalog, map_id, kind=JobKind.FIT, waiting_for=WaitingFor.DESCRIPTORS)
-    with catalog.write() as session:
-        wake_vocabulary_waiters(session, map_id)
-    assert take(catalog) == []
+    assert take(catalog) == [], "waiters of another map and for something else stay"
 
 
 def test_a_job_whose_time_has_not_come_is_held_back(catalog: Catalog, map_id: UUID) -> None:
@@ -213,10 +208,10 @@ def test_a_claim_passes_over_what_another_one_is_just_taking(postgres: PostgresS
     catalog.close()
 
 
-def test_jobs_are_listed_newest_first_and_filtered(catalog: Catalog, map_id: UUID) -> None:
+def test_jobs_of_a_map_are_listed_newest_first_and_filtered(catalog: Catalog, map_id: UUID) -> None:
     with catalog.write() as session:
         other = add_map(session, "other").id
-    queue(catalog, other)
+    (elsewhere,) = queue(catalog, other)
     old, new = queue(catalog, map_id, 2)
     (failed,) = queue(catalog, map_id, kind=JobKind.DESCRIBE, state=JobState.FAILED)
     (reindex,) = queue(catalog, map_id, kind=JobKind.REINDEX)
@@ -226,11 +221,5 @@ def test_jobs_are_listed_newest_first_and_filtered(catalog: Catalog, map_id: UUI
         assert ids(list_jobs(session, map_id, [], [], 10, new)) == [old]
         assert ids(list_jobs(session, map_id, [JobState.FAILED], [], 10, None)) == [failed]
         assert ids(list_jobs(session, map_id, [], [JobKind.REINDEX], 10, None)) == [reindex]
-
-
-def test_a_job_of_another_map_is_not_found(catalog: Catalog, map_id: UUID) -> None:
-    with catalog.write() as session:
-        other = add_map(session, "other").id
-    (job_id,) = queue(catalog, other)
-    with catalog.read() as session, pytest.raises(NotFound):
-        get_job(session, map_id, job_id)
+        with pytest.raises(NotFound):
+            get_job(session, map_id, elsewhere)

@@ -44,15 +44,19 @@ def test_a_finished_job_can_not_be_cancelled(catalog: Catalog, map_id: UUID) -> 
         assert states(catalog, [job_id]) == [state]
 
 
-def test_a_cancelled_job_is_over_at_once(catalog: Catalog, map_id: UUID) -> None:
+def test_a_cancelled_job_is_over_at_once_and_the_others_of_its_batch_go_on(
+    catalog: Catalog, map_id: UUID
+) -> None:
     queued = queue(catalog, map_id, waiting_for=WaitingFor.VOCABULARY)
-    running = queue(catalog, map_id)
+    first, running, last = queue(catalog, map_id, 3)
     jobs = take(catalog)
+    cancelled = [*queued, running]
     with catalog.write() as session:
-        for job_id in queued + running:
+        for job_id in cancelled:
             cancel_job(session.get_one(Job, job_id))
-    assert end(catalog, jobs) == []
-    for job_id in queued + running:
+    assert end(catalog, jobs) == [first, last]
+    assert states(catalog, [first, last]) == [JobState.SUCCEEDED] * 2
+    for job_id in cancelled:
         job = read_job(catalog, job_id)
         assert (job.state, job.waiting_for) == (JobState.CANCELLED, None)
         assert (job.lease_token, job.lease_until) == (None, None)
