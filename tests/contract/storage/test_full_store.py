@@ -104,6 +104,7 @@ def test_what_a_bucket_refuses_has_its_meaning(
 
 
 @pytest.mark.databases("sqlite")  # which is the same to a store that is full
+@pytest.mark.parametrize("refusal", [REFUSALS[0], REFUSALS[3]], indirect=True)
 @pytest.mark.parametrize("path", ["/upload", "/similarity"])
 def test_nothing_is_acknowledged_that_was_not_stored(
     full: S3Store,
