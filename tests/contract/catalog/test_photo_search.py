@@ -129,17 +129,17 @@ def test_filters_work_together_in_one_map_and_role(catalog: Catalog, map_id: UUI
         "longitude": 7.69,
         "place": "hall",
     }
-    later = MOMENT + timedelta(days=1)
+    others: list[dict[str, Any]] = [
+        *({"filename": "y.jpg"}, {"tags": ["u"]}, {"size_bytes": 6}),
+        *({"uploaded_at": MOMENT + timedelta(days=1)}, {"latitude": 45.08}, {"place": None}),
+    ]
     with catalog.write() as session:
         other = add_map(session, "other").id
         right = add_photo(session, map_id, **params).id
         asking = add_photo(session, map_id, **params, role=PhotoRole.QUERY).id
         add_photo(session, other, **params)
-        for wrong in (
-            *({"filename": "y.jpg"}, {"tags": ["u"]}, {"size_bytes": 6}, {"uploaded_at": later}),
-            *({"latitude": 45.08}, {"place": None}),
-        ):
-            add_photo(session, map_id, **{**params, **wrong})
+        for wrong in others:
+            add_photo(session, map_id, **(params | wrong))
     about = PhotoFilter(
         tags=("t",), place="hall", near=Circle(latitude=45.0701, longitude=7.69, radius_m=100)
     )

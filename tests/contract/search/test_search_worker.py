@@ -285,24 +285,21 @@ class TestSearchWorkerOnADevice(TestSearchWorker):
 
         return open_port
 
-    def test_status_has_what_lies_on_the_device(self, places: SmallMap, port: OpenPort) -> None:
+    def test_status_and_metrics_have_what_lies_on_the_device(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
         places.add(unit_rows(1, 40))
         search = port()
+        assert isinstance(search, SearchWorker)
         (device,) = search.status().devices
         assert device.name == "cpu"
         assert list(device.generations) == [places.generation_id]
         before = device.resident_bytes
+        text = MeteredSearch(search).render().decode()
+        assert f'placewise_search_device_resident_bytes{{device="cpu"}} {before:.1f}' in text
+        assert 'placewise_search_device_failed{device="cpu"} 0.0' in text
         places.add(unit_rows(2, 40))
         search.search(places.request(places.query(unit_rows(3, 1)[0])))
-        there = search.status().devices[0].resident_bytes
-        assert there == 2 * before, "a new chunk is on the device at once"
-        assert search.status().devices[0].failure is None
-
-    def test_metrics_tell_what_lies_on_the_device(self, places: SmallMap, port: OpenPort) -> None:
-        places.add(unit_rows(1, 40))
-        search = port()
-        assert isinstance(search, SearchWorker)
-        text = MeteredSearch(search).render().decode()
-        bytes_there = search.status().devices[0].resident_bytes
-        assert f'placewise_search_device_resident_bytes{{device="cpu"}} {bytes_there:.1f}' in text
-        assert 'placewise_search_device_failed{device="cpu"} 0.0' in text
+        (device,) = search.status().devices
+        assert device.resident_bytes == 2 * before, "a new chunk is on the device at once"
+        assert device.failure is None
