@@ -89,24 +89,31 @@ def written(store: FolderStore, rows: Rows) -> Chunk:
     )
 
 
-def test_rows_are_those_that_were_written(store: FolderStore, folder: Path) -> None:
-    rows = unit_rows(5)
-    stored = ChunkLoader(store, folder).load_rows(written(store, rows))
-    np.testing.assert_array_equal(stored.rows, rows)
-    assert not stored.rows.flags.writeable
-    stored.file.prefetch(5000, 100_000)
-
-
-def test_rows_stay_readable_when_the_object_and_its_copy_are_deleted(
+def test_rows_are_those_that_were_written_also_when_the_object_and_its_copy_are_deleted(
     store: FolderStore, folder: Path
 ) -> None:
     rows = unit_rows(5)
     chunk = written(store, rows)
     loader = ChunkLoader(store, folder)
     stored = loader.load_rows(chunk)
+    assert not stored.rows.flags.writeable
+    stored.file.prefetch(5000, 100_000)
     delete_chunk(store, chunk.object_key)
     loader.evict_except([])
     np.testing.assert_array_equal(stored.rows, rows)
+
+
+def test_objects_of_a_bucket_are_fetched_once_and_files_of_a_folder_are_not_copied(
+    tmp_path: Path, folder: Path
+) -> None:
+    files = FolderStore(tmp_path / "files")
+    ChunkLoader(files, folder).load_rows(written(files, unit_rows(5)))
+    assert not folder.exists()
+    bucket = Bucket(tmp_path / "objects")
+    chunk = written(bucket, unit_rows(5))
+    for _ in range(3):
+        ChunkLoader(bucket, folder).load_rows(chunk)
+    assert bucket.opened == 1
 
 
 @pytest.mark.parametrize("damage", [lambda data: data[:-7], lambda data: data[:-1] + b"?"])
@@ -126,14 +133,6 @@ def test_damaged_chunk_is_refused_by_its_hash_and_served_once_it_is_repaired(
     assert len(loader.load_rows(chunk).rows) == 5
 
 
-def test_objects_of_a_bucket_are_fetched_once(tmp_path: Path, folder: Path) -> None:
-    store = Bucket(tmp_path / "objects")
-    chunk = written(store, unit_rows(5))
-    for _ in range(3):
-        ChunkLoader(store, folder).load_rows(chunk)
-    assert store.opened == 1
-
-
 @pytest.mark.parametrize("damage", [b"", b"x" * 1000], ids=["empty", "other bytes"])
 def test_a_damaged_copy_in_the_cache_is_fetched_again(
     tmp_path: Path, folder: Path, damage: bytes
@@ -146,12 +145,6 @@ def test_a_damaged_copy_in_the_cache_is_fetched_again(
     assert np.array_equal(ChunkLoader(bucket, folder).load_rows(chunk).rows, rows)
     assert np.array_equal(ChunkLoader(bucket, folder).load_rows(chunk).rows, rows)
     assert bucket.opened == 1
-
-
-def test_files_of_a_folder_are_not_copied(tmp_path: Path, folder: Path) -> None:
-    store = FolderStore(tmp_path / "objects")
-    ChunkLoader(store, folder).load_rows(written(store, unit_rows(5)))
-    assert not folder.exists()
 
 
 def test_only_the_files_of_chunks_that_are_searched_are_kept(tmp_path: Path, folder: Path) -> None:
@@ -179,16 +172,13 @@ def loaded(stored: StoredChunk) -> LoadedChunk:
 
 
 def test_codes_lie_beside_a_long_chunk_and_beside_no_short_one(store: FolderStore) -> None:
-    assert store.head(codes_key(written(store, unit_rows(MANY)).object_key)) is not None
-    short = written(store, unit_rows(MANY - 2))
+    long, short = written(store, unit_rows(MANY)), written(store, unit_rows(MANY - 2))
+    assert store.head(codes_key(long.object_key)) is not None
     assert store.head(codes_key(short.object_key)) is None
-    delete_chunk(store, short.object_key)
-
-
-def test_deleting_a_chunk_deletes_its_codes(store: FolderStore) -> None:
-    chunk = written(store, unit_rows(MANY))
-    delete_chunk(store, chunk.object_key)
-    assert list(store.list("")) == []
+    for chunk in (long, short):
+        delete_chunk(store, chunk.object_key)
+    assert list(store.list("")) == [], "manifests and codes go with their chunks"
+    delete_chunk(store, long.object_key)
 
 
 def test_codes_that_lie_beside_a_chunk_are_not_made_again(
@@ -215,21 +205,11 @@ def test_codes_that_are_missing_are_made_once(
         monkeypatch.delattr(shared.codes.serialization, "encode_signs", raising=False)
 
 
-@pytest.mark.parametrize("where", ["beside the chunk", "in the cache"])
-def test_damaged_codes_are_made_again_and_the_chunk_is_served(
-    store: FolderStore, folder: Path, where: str
-) -> None:
+def test_damaged_codes_beside_a_chunk_are_made_again(store: FolderStore, folder: Path) -> None:
     rows = unit_rows(MANY)
     chunk = written(store, rows)
     key = codes_key(chunk.object_key)
-    whole = store.get(key)
-    if where == "in the cache":
-        loader = ChunkLoader(store, folder)
-        loader.load_sign_codes(chunk.object_key, loader.load_rows(chunk))
-        (retained,) = folder.glob("*.codes")
-        retained.write_bytes(whole[:-1] + b"?")
-    else:
-        store.put(key, whole[:-1] + b"?")
+    store.put(key, store.get(key)[:-1] + b"?")
     loader = ChunkLoader(store, folder)
     codes = loader.load_sign_codes(chunk.object_key, loader.load_rows(chunk))
     np.testing.assert_array_equal(codes.levels[-1], encode_signs(rows).levels[-1])

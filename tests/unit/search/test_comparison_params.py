@@ -55,7 +55,7 @@ def test_what_is_no_sum_over_patches_says_why(
     assert refused.value.code == "not_explainable"
 
 
-def test_one_feature_of_a_photo_can_t_be_reranked() -> None:
+def test_a_photo_is_reranked_by_its_patches_however_they_are_pooled() -> None:
     with pytest.raises(Unprocessable, match="compares patches") as refused:
         check_rerankable(config_of(HUB))
     assert refused.value.code == "not_rerankable"

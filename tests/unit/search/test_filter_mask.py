@@ -58,42 +58,18 @@ def test_what_is_excluded_or_dead_or_asks_never_passes(data: some.DataObject) ->
 @pytest.mark.parametrize(
     ("photo_filter", "passing"),
     [
-        pytest.param(PhotoFilter(), "west east pole nowhere", id="no filter"),
-        pytest.param(PhotoFilter(ids=()), "", id="no ids"),
-        pytest.param(PhotoFilter(ids=(IDS[1], IDS[1], IDS[39])), "east", id="ids"),
-        pytest.param(
-            PhotoFilter(box=Box(south=-1, west=179, north=1, east=-179)),
-            "west east",
-            id="a box across the antimeridian",
-        ),
-        pytest.param(
-            PhotoFilter(box=Box(south=0, west=180, north=0, east=180)), "west", id="a point's box"
-        ),
-        pytest.param(
-            PhotoFilter(box=Box(south=-90, west=-180, north=90, east=180)),
-            "west east pole",
-            id="a box round the Earth",
-        ),
-        pytest.param(
-            PhotoFilter(box=Box(south=80, west=0, north=90, east=1)), "pole", id="up to the pole"
-        ),
-        pytest.param(
-            PhotoFilter(near=Circle(latitude=89.9, longitude=-60, radius_m=12_000)),
-            "pole",
-            id="a circle over the pole",
-        ),
-        pytest.param(
-            PhotoFilter(near=Circle(latitude=0, longitude=180, radius_m=112_000)),
-            "west east",
-            id="a circle across the antimeridian",
-        ),
-        pytest.param(
-            PhotoFilter(near=Circle(latitude=0, longitude=-179, radius_m=0)), "east", id="radius 0"
-        ),
-        pytest.param(
+        (PhotoFilter(), "west east pole nowhere"),
+        (PhotoFilter(ids=(IDS[1], IDS[1], IDS[39])), "east"),
+        (PhotoFilter(box=Box(south=-1, west=179, north=1, east=-179)), "west east"),
+        (PhotoFilter(box=Box(south=0, west=180, north=0, east=180)), "west"),
+        (PhotoFilter(box=Box(south=-90, west=-180, north=90, east=180)), "west east pole"),
+        (PhotoFilter(box=Box(south=80, west=0, north=90, east=1)), "pole"),
+        (PhotoFilter(near=Circle(latitude=89.9, longitude=-60, radius_m=12_000)), "pole"),
+        (PhotoFilter(near=Circle(latitude=0, longitude=180, radius_m=112_000)), "west east"),
+        (PhotoFilter(near=Circle(latitude=0, longitude=-179, radius_m=0)), "east"),
+        (
             PhotoFilter(near=Circle(latitude=-33, longitude=12, radius_m=HALF_EARTH_M)),
             "west east pole",
-            id="half the Earth round",
         ),
     ],
 )
@@ -131,14 +107,3 @@ def test_changed_columns_leave_those_before_them_alone() -> None:
     assert list(build_row_mask(after, in_hall, ())) == [True, True]
     assert np.isnan(before.latitude[1])
     assert before.with_changes({IDS[7]: facts_of(IDS[7])}) is before
-
-
-def test_all_tags_are_required_and_case_sensitive() -> None:
-    photos = [
-        facts_of(IDS[0], tags=("wet", "night", "old")),
-        facts_of(IDS[1], tags=("night",)),
-        facts_of(IDS[2], tags=("Night", "wet")),
-        facts_of(IDS[3]),
-    ]
-    assert selected(photos, PhotoFilter(tags=("night", "wet"))) == [IDS[0]]
-    assert selected(photos, PhotoFilter(tags=("wet",))) == [IDS[0], IDS[2]]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 from uuid import UUID
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -76,6 +75,18 @@ def test_a_photo_that_two_shards_have_for_a_moment_is_answered_once() -> None:
     assert ranked(merged) == [(1, 0.9), (2, 0.8), (3, 0.6)]
 
 
+def test_the_weakest_certificate_and_the_largest_error_count() -> None:
+    exact = merge_responses([answer(), answer()], 1)
+    assert (exact.certificate, exact.max_z) == (EXHAUSTIVE, None)
+    newer = answer(certificate="of the future", max_z=1.5)
+    merged = merge_responses([answer(), newer, answer(max_z=3.0)], 1)
+    assert (merged.certificate, merged.max_z) == ("of the future", 3.0)
+    gaps: list[tuple[tuple[str, ...], list[Shard]]] = [(("chunks/a",), []), ((), [Shard(1, 2)])]
+    for missing, away in gaps:
+        merged = merge_responses([answer((1, 0.9), missing=missing)], 1, away)
+        assert merged.certificate == NONE, "it lacks a part of the map"
+
+
 def test_sums_least_version_and_missing_chunks_are_merged() -> None:
     merged = merge_responses(
         [
@@ -87,29 +98,6 @@ def test_sums_least_version_and_missing_chunks_are_merged() -> None:
     )
     assert (merged.snapshot_version, merged.rows_scanned, merged.rows_reranked) == (8, 7, 3)
     assert merged.missing == ("chunks/a", "chunks/b", "shard 1/4", "shard 3/4")
-
-
-@pytest.mark.parametrize(
-    ("missing", "away"), [(("chunks/a",), []), ((), [Shard(1, 2)])], ids=["chunk", "shard"]
-)
-def test_nothing_is_certain_of_an_answer_that_lacks_a_part_of_the_map(
-    missing: tuple[str, ...], away: list[Shard]
-) -> None:
-    merged = merge_responses([answer((1, 0.9), missing=missing)], 1, away)
-    assert merged.certificate == NONE
-
-
-def test_the_weakest_certificate_counts() -> None:
-    assert merge_responses([answer(), answer()], 1).certificate == EXHAUSTIVE
-    assert (
-        merge_responses([answer(), answer(certificate="of the future")], 1).certificate
-        == "of the future"
-    )
-
-
-def test_largest_error_of_an_estimate_is_merged_and_none_without_estimates() -> None:
-    assert merge_responses([answer(), answer()], 1).max_z is None
-    assert merge_responses([answer(max_z=1.5), answer(), answer(max_z=3.0)], 1).max_z == 3.0
 
 
 def test_what_a_newer_worker_adds_to_its_answer_is_passed_over() -> None:

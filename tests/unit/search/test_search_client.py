@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
@@ -13,11 +13,7 @@ import pytest
 from shared.errors import Unavailable
 from shared.ids import new_id
 from shared.search_api.client import HttpSearchClient
-from shared.search_api.protocol import (
-    SearchRequest,
-    SearchResponse,
-    SearchStatus,
-)
+from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
 from tests.support.servers.handle import wait_until
 
 REQUEST = SearchRequest(
@@ -76,15 +72,7 @@ def worker() -> Iterator[FakeWorker]:
         thread.join()
 
 
-def test_a_search_of_a_closed_client_is_unavailable(worker: FakeWorker) -> None:
-    with HttpSearchClient([worker.url], 10.0) as client:
-        pass
-    with pytest.raises(Unavailable) as refused:
-        client.search(REQUEST)
-    assert refused.value.code == "search_unavailable"
-
-
-def test_a_queued_search_is_unavailable_when_the_client_is_closed(
+def test_a_search_that_is_queued_or_begins_when_the_client_is_closed_is_unavailable(
     worker: FakeWorker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shared.search_api.client.MAX_CONCURRENT_CALLS", 1)
@@ -99,6 +87,11 @@ def test_a_queued_search_is_unavailable_when_the_client_is_closed(
             wait_until(lambda: queue.qsize() == 1, 30, lambda: None, "the queued call")
             threading.Timer(0.2, worker.released.set).start()
         assert first.result() == RESPONSE
-        with pytest.raises(Unavailable) as refused:
-            queued.result()
-    assert refused.value.code == "search_unavailable"
+        searches: list[Callable[[], SearchResponse]] = [
+            queued.result,
+            lambda: client.search(REQUEST),
+        ]
+        for search in searches:
+            with pytest.raises(Unavailable) as refused:
+                search()
+            assert refused.value.code == "search_unavailable"

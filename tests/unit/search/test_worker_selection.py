@@ -132,7 +132,6 @@ def test_a_new_number_of_shards_is_used_once_all_of_them_have_the_generation(
         httpx2.Response(200, json={"hits": []}),
         httpx2.Response(500, json={"code": "internal_error", "detail": "Something went wrong."}),
         httpx2.ConnectTimeout("late"),
-        httpx2.RemoteProtocolError("nonsense"),
         httpx2.DecodingError("cut off"),
     ],
 )
