@@ -94,30 +94,20 @@ def test_labels_look_like_paths_if_most_have_levels_and_two_share_the_first(
     assert look_like_paths(labels) is are_paths
 
 
-def test_a_label_that_is_no_path_is_its_only_level() -> None:
-    assert label_levels("a/b", is_path=False) == ("a/b",)
-
-
 def test_every_label_lies_within_its_levels_and_not_within_names_that_begin_alike() -> None:
     for text in ("a", "a//b", "/a/b/", "a/ /b"):
         assert all(is_within_level(text, level) for level in label_levels(text, is_path=True))
     assert not is_within_level("tower/floor 70", "tower/floor 7")
+    assert label_levels("a/b", is_path=False) == ("a/b",), "what is no path is its only level"
 
 
-def test_each_level_lies_inside_the_coarser_one() -> None:
+def test_each_level_lies_inside_the_coarser_one_and_the_finest_is_where_most_labels_end() -> None:
     ranked = ranking((0.9, label("b/1/x")), (0.88, label("a/1/x")), (0.87, label("a/1/x")))
     assert places(ranked) == ["a/1/x", "a/1", "a"]
-
-
-def test_an_estimate_ends_where_most_labels_end() -> None:
+    assert places(ranking((0.9, label("a/1/x")), (0.5, label("a/1/y"))), PLAIN) == ["a/1/x"]
     ranked = ranking((0.9, label("a/1")), (0.9, label("a/1")), (0.9, label("a/1/x")))
     assert places(ranked) == ["a/1", "a"]
     assert places(ranked[:1] + ranked[2:] * 2) == ["a/1/x", "a/1", "a"]
-
-
-def test_labels_with_slashes_are_whole_labels_in_other_maps() -> None:
-    ranked = ranking((0.9, label("a/1/x")), (0.5, label("a/1/y")))
-    assert places(ranked, PLAIN) == ["a/1/x"]
 
 
 def test_photos_without_labels_have_no_vote_and_no_level() -> None:
@@ -382,18 +372,13 @@ def own_samples(places: int = 40, per_place: int = 5, noise: float = 1.0) -> lis
     return list(own.samples(photos, own.spread(photos)))
 
 
-def test_probabilities_of_held_out_photos_are_those_that_are_observed() -> None:
+def test_held_out_photos_have_the_observed_probabilities_and_few_impostors_get_an_answer() -> None:
     evaluation = evaluate_places(own_samples(), [], PATHS, 0.5)
     assert evaluation.figures is not None
     assert evaluation.model.source == "own_photos"
     for level in evaluation.figures["levels"]:
         assert level["calibration_error"] < 0.1
         assert level["samples"] == 200
-
-
-def test_the_answers_at_a_certainty_are_right_and_few_impostors_get_one() -> None:
-    evaluation = evaluate_places(own_samples(), [], PATHS, 0.5)
-    assert evaluation.figures is not None
     shares = []
     for answers in evaluation.figures["answers"]:
         shares.append(answers["answered"]["mean"])
