@@ -70,7 +70,9 @@ def test_descriptors_are_those_of_the_network_on_normalised_pixels(folder: Path)
     assert rows.dtype == np.float32
 
 
-def test_dimension_is_found_by_describing_and_stands_in_the_spec(folder: Path) -> None:
+def test_dimension_is_found_by_describing_and_of_several_answers_the_first_counts(
+    folder: Path,
+) -> None:
     made = extractor(folder, "colours:dimension=40,input.size=32x48")
     spec = made.spec(None)
     assert (spec["dimension"], made.dimension(None)) == (40, 40)
@@ -78,9 +80,6 @@ def test_dimension_is_found_by_describing_and_stands_in_the_spec(folder: Path) -
     assert spec["preprocessing"] == {"name": "resize32x48", "version": 1}
     assert pixels_of(made, 1).shape == (1, 32, 48, 3)
     assert made.shipped_vocabulary() is None
-
-
-def test_of_several_answers_the_first_is_the_descriptor(folder: Path) -> None:
     one, both = extractor(folder, "colours"), extractor(folder, "with_attention")
     pixels = pixels_of(one, 3)
     np.testing.assert_array_equal(both.describe(pixels, None), one.describe(pixels, None))
@@ -89,13 +88,26 @@ def test_of_several_answers_the_first_is_the_descriptor(folder: Path) -> None:
 # --- what pins it ----------------------------------------------------------------------------
 
 
-def test_fingerprint_is_the_same_when_the_folder_is_loaded_again(
+def test_the_spec_names_the_code_the_arguments_and_the_weights_and_nothing_else(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "dont_write_bytecode", False)
     monkeypatch.setattr(sys, "pycache_prefix", None)
-    assert extractor(folder, "colours").spec(None) == extractor(folder, "colours").spec(None)
+    first = extractor(folder, "colours").spec(None)
+    assert extractor(folder, "colours").spec(None) == first
     assert not list(folder.rglob("*.pyc")), "loading changes nothing in the folder"
+    for name in (".git/HEAD", "__pycache__/networks.pyc", ".DS_Store"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text("x")
+    assert extractor(folder, "colours").spec(None) == first, "these are no code"
+
+    def changed(entry: str) -> set[str]:
+        spec = extractor(folder, entry).spec(None)
+        return {key for key in first if first[key] != spec[key]}
+
+    assert changed("colours:scale=2.0") == {"extractor", "backbone", "backbone_fingerprint"}
+    (folder / "settings.json").write_text("{}")
+    assert changed("colours") == {"code_fingerprint"}, "code that only reads otherwise"
 
 
 def test_changed_code_is_another_spec_and_is_what_runs(folder: Path) -> None:
@@ -108,34 +120,6 @@ def test_changed_code_is_another_spec_and_is_what_runs(folder: Path) -> None:
     assert after.backbone.fingerprint != before.backbone.fingerprint
     pixels = pixels_of(after, 1)
     assert not np.allclose(after.describe(pixels, None), before.describe(pixels, None))
-
-
-def test_code_that_only_reads_otherwise_is_another_spec_with_the_same_weights(
-    folder: Path,
-) -> None:
-    before = extractor(folder, "colours").spec(None)
-    (folder / "settings.json").write_text("{}")
-    after = extractor(folder, "colours").spec(None)
-    differing = {key for key in before if before[key] != after[key]}
-    assert differing == {"code_fingerprint"}
-
-
-def test_hidden_files_and_bytecode_are_no_code(folder: Path) -> None:
-    before = extractor(folder, "colours").spec(None)
-    for name in (".git/HEAD", "__pycache__/networks.pyc", ".DS_Store"):
-        (folder / name).parent.mkdir(exist_ok=True)
-        (folder / name).write_text("x")
-    assert extractor(folder, "colours").spec(None) == before
-
-
-def test_arguments_and_weights_are_part_of_the_spec(folder: Path) -> None:
-    plain = extractor(folder, "colours").spec(None)
-    scaled = extractor(folder, "colours:scale=2.0").spec(None)
-    assert {key for key in plain if plain[key] != scaled[key]} == {
-        "extractor",
-        "backbone",
-        "backbone_fingerprint",
-    }
 
 
 def test_two_repositories_with_modules_of_one_name_do_not_meet(
