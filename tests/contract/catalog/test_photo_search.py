@@ -29,7 +29,9 @@ def found(catalog: Catalog, map_id: UUID, **params: Any) -> set[str]:
     return {photo.filename for photo in page}
 
 
-def test_a_file_name_is_found_by_a_part_of_it_in_any_case(catalog: Catalog, map_id: UUID) -> None:
+def test_a_photo_is_found_by_a_part_of_its_name_or_relative_path_in_any_case(
+    catalog: Catalog, map_id: UUID
+) -> None:
     with catalog.write() as session:
         for name in ("Market-Street.JPG", "market hall.png", "harbour.jpg"):
             add_photo(session, map_id, filename=name)
@@ -37,9 +39,6 @@ def test_a_file_name_is_found_by_a_part_of_it_in_any_case(catalog: Catalog, map_
     assert found(catalog, map_id, filename="street.jpg") == {"Market-Street.JPG"}
     assert found(catalog, map_id, filename="square") == set()
     assert found(catalog, map_id) == {"Market-Street.JPG", "market hall.png", "harbour.jpg"}
-
-
-def test_a_photo_is_found_by_a_part_of_its_relative_path(catalog: Catalog, map_id: UUID) -> None:
     with catalog.write() as session:
         add_photo(session, map_id, filename="1.jpg", relative_path="Spring/old_town/1.jpg")
         add_photo(session, map_id, filename="2.jpg", relative_path="autumn/2.jpg")

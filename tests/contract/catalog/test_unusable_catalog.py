@@ -186,7 +186,7 @@ def test_a_catalog_without_room_is_a_507(catalog: Catalog, client: TestClient) -
     assert client.get("/api/v1/maps").status_code == 200
 
 
-def test_an_error_of_a_failing_disk_is_no_outage() -> None:
+def test_a_failing_disk_and_a_postgresql_without_room_are_no_outages() -> None:
     original = sqlite3.OperationalError("disk I/O error")
     original.sqlite_errorname = "SQLITE_IOERR_READ"
     error = to_unavailable(OperationalError("SELECT 1", {}, original))
@@ -194,8 +194,6 @@ def test_an_error_of_a_failing_disk_is_no_outage() -> None:
     assert (error.code, error.status) == ("catalog_io_error", 503)
     assert "dmesg" in error.detail
 
-
-def test_postgresql_without_room_is_full_and_not_away() -> None:
     class DiskFull(Exception):
         sqlstate = "53100"
 
