@@ -22,7 +22,7 @@ from shared.descriptors.extractor import Extractor
 from shared.descriptors.vocabulary import ClusterCentres
 from shared.errors import PlacewiseError
 from shared.extractor_config.configs import get_extractor_config
-from tests.support.photos import encoded, photo_bytes, turned_photo
+from tests.support.photos import encoded, turned_photo
 
 Row = NDArray[np.float32]
 
@@ -66,16 +66,6 @@ class Describing:
         row: Row = self._extractor.describe([decoded.pixels], self._centres)[0]
         assert np.linalg.norm(row) == pytest.approx(1.0, abs=1e-5)
         return row
-
-    def refusal(self, data: bytes) -> PlacewiseError:
-        good = photo_bytes(1)
-        before, refused, after = self._pool.decode(
-            [good, data, good], self._extractor.preprocessing
-        )
-        assert isinstance(refused, PlacewiseError)
-        for beside in (before, after):
-            assert not isinstance(beside, PlacewiseError), beside
-        return refused
 
 
 @pytest.fixture
@@ -152,26 +142,6 @@ def test_very_long_photo_has_the_descriptor_of_what_it_shows_squeezed(
     )
     paper = Describing(pool, extractors["paper480x640"], centres)
     assert np.isfinite(paper.row(encoded(strip, "PNG"))).all()
-
-
-# --- a clear error ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["demo1024", "round14"])
-def test_photo_of_less_than_a_patch_is_rejected_where_photos_are_not_resized(
-    pool: DecoderPool, extractors: dict[str, Extractor], centres: ClusterCentres, name: str
-) -> None:
-    describing = Describing(pool, extractors[name], centres)
-    error = describing.refusal(encoded(Image.new("RGB", (20_000, 3)), "PNG"))
-    assert error.code == "photo_too_small"
-    assert "20000 x 3 pixels" in error.detail
-
-
-def test_truncated_jpeg_is_refused(service: Describing) -> None:
-    whole = encoded(photograph(), "JPEG")
-    for share in (0.05, 0.95):
-        error = service.refusal(whole[: int(share * len(whole))])
-        assert error.code == "undecodable_photo"
 
 
 # --- photos of many sizes --------------------------------------------------------------------
