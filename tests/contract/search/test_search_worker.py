@@ -31,14 +31,15 @@ from tests.contract.search.test_search_backend import (
 from tests.support.small_map import SmallMap, assert_answers, damaged, unit_rows
 
 
+@pytest.fixture
+def port(catalog: Catalog, store: FolderStore, settings: Settings) -> OpenPort:
+    def open_port(**options: Any) -> SearchBackend:
+        return SearchWorker(catalog, store, settings, **options)
+
+    return open_port
+
+
 class TestSearchWorker(SearchPortContract):
-    @pytest.fixture
-    def port(self, catalog: Catalog, store: FolderStore, settings: Settings) -> OpenPort:
-        def open_port(**options: Any) -> SearchBackend:
-            return SearchWorker(catalog, store, settings, **options)
-
-        return open_port
-
     def test_repaired_chunk_is_served_again_without_a_new_version(
         self,
         catalog: Catalog,
@@ -231,13 +232,6 @@ class TestSearchWorkerOfFloat16Rows(SearchPortContract):
     @pytest.fixture
     def places(self, catalog: Catalog, store: FolderStore) -> SmallMap:
         return SmallMap(catalog, store, RowType.FLOAT16)
-
-    @pytest.fixture
-    def port(self, catalog: Catalog, store: FolderStore, settings: Settings) -> OpenPort:
-        def open_port(**options: Any) -> SearchBackend:
-            return SearchWorker(catalog, store, settings, **options)
-
-        return open_port
 
     def test_merged_rows_are_those_that_were_written(
         self, places: SmallMap, store: FolderStore
