@@ -180,16 +180,16 @@ class TestFolderStoreWithOriginalsElsewhere(ObjectStoreContract):
         assert list(partial.iterdir()) == []
         killed.abort()
 
-    def test_the_folders_own_names_are_no_keys(self, store: FolderStore, tmp_path: Path) -> None:
+    def test_the_folders_own_names_are_no_keys_and_strange_files_are_not_listed(
+        self, store: FolderStore, tmp_path: Path
+    ) -> None:
         (tmp_path / "photos" / ".placewise").write_text("whose it is")
         assert keys_of(store, "originals/") == []
         for key in ("originals/.partial/a", "originals/.placewise", "originals/../b"):
             with pytest.raises(ValueError):
                 store.head(key)
-
-    def test_what_lies_where_its_key_does_not_lead_is_not_listed(self, store: FolderStore) -> None:
         (store.root / "originals").mkdir()
-        (store.root / "originals" / "old").write_bytes(b"from before")
+        (store.root / "originals" / "old").write_bytes(b"where its key does not lead")
         assert keys_of(store) == []
         assert store.head("originals/old") is None
 

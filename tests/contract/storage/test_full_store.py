@@ -151,7 +151,9 @@ class FullFile:
 
 
 @pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EDQUOT], ids=["disk", "quota"])
-def test_a_full_disk_is_reported_and_leaves_no_object(store: FolderStore, reason: int) -> None:
+def test_a_full_disk_is_reported_unlike_another_fault_and_leaves_no_object(
+    store: FolderStore, reason: int
+) -> None:
     writer = store.writer("originals/a")
     writer.write(b"some")
     writer._file.close()
@@ -163,6 +165,12 @@ def test_a_full_disk_is_reported_and_leaves_no_object(store: FolderStore, reason
     writer.abort()
     assert list(store.list("")) == []
     assert list((store.root / ".partial").iterdir()) == []
+    writer = store.writer("originals/a")
+    writer._file.close()
+    writer._file = FullFile(0, errno.EIO)  # type: ignore[assignment]
+    with pytest.raises(OSError, match="Input/output"):
+        writer.write(b"some")
+    writer.abort()
 
 
 def test_a_disk_that_fills_up_while_it_syncs_is_full_too(
@@ -175,12 +183,3 @@ def test_a_disk_that_fills_up_while_it_syncs_is_full_too(
     with pytest.raises(StorageFull):
         store.put("originals/a", b"some")
     assert store.head("originals/a") is None
-
-
-def test_another_fault_of_the_disk_is_not_called_full(store: FolderStore) -> None:
-    writer = store.writer("originals/a")
-    writer._file.close()
-    writer._file = FullFile(0, errno.EIO)  # type: ignore[assignment]
-    with pytest.raises(OSError, match="Input/output"):
-        writer.write(b"some")
-    writer.abort()
