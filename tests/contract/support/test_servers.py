@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,8 @@ from typing import Any
 import psutil
 import psycopg
 import pytest
-from redis import Redis
-from redis.exceptions import RedisError
 from sqlalchemy.engine import make_url
 
-from shared.errors import Unavailable
-from shared.storage.s3 import S3Store
 from tests.support.servers import (
     PostgresServer,
     RedisServer,
@@ -59,54 +54,6 @@ def asks_postgres(url: str) -> Callable[[], object]:
             return connection.execute("SELECT 1").fetchone()
 
     return ask
-
-
-def asks_redis(url: str) -> Callable[[], object]:
-    def ask() -> object:
-        with Redis.from_url(url, socket_timeout=1) as client:
-            return client.ping()
-
-    return ask
-
-
-@contextlib.contextmanager
-def started(name: str) -> Iterator[tuple[Any, Callable[[], object]]]:
-    """A server of the test's own, its handle, and a question that it answers while it can."""
-    if name == "postgres":
-        with start_postgres(own=True) as database:
-            yield database.process, asks_postgres(database.new_database())
-    elif name == "redis":
-        with start_redis(own=True) as broker:
-            yield broker.process, asks_redis(broker.url)
-    else:
-        with start_s3(own=True) as objects:
-            store = S3Store(objects.new_bucket())
-            store.put("a", b"kept")
-            yield objects.process, lambda: store.get("a")
-
-
-@pytest.mark.parametrize("name", ["postgres", "redis", "s3"])
-def test_a_killed_server_comes_back_on_its_port_with_its_data(name: str) -> None:
-    with started(name) as (process, ask):
-        assert ask()
-        process.kill()
-        with pytest.raises((psycopg.OperationalError, RedisError, Unavailable)):
-            ask()
-        process.start()
-        assert ask()
-
-
-@pytest.mark.parametrize("name", ["postgres", "redis"])
-def test_a_stopped_server_comes_back_and_a_paused_one_goes_on(name: str) -> None:
-    # SeaweedFS, which takes 15 s to stop, is paused in tests/faults.
-    with started(name) as (process, ask):
-        process.stop()
-        process.start()
-        process.pause()
-        with pytest.raises((psycopg.OperationalError, RedisError)):
-            ask()
-        process.resume()
-        assert ask()
 
 
 @every_server
