@@ -94,16 +94,6 @@ def test_published_ways_give_the_published_numbers(name: str, size: tuple[int, i
     assert float(differences.mean()) < ON_AVERAGE
 
 
-def test_sizes_are_those_that_the_papers_name() -> None:
-    def size(name: str, width: int, height: int) -> tuple[int, ...]:
-        return get_preprocessing(name).apply(Image.new("RGB", (width, height))).shape[:2]
-
-    assert size("paper480x640", 700, 1000) == (476, 630)
-    assert size("demo1024", 2000, 1500) == (756, 1022)
-    assert size("demo1024", 640, 480) == (476, 630)
-    assert size("round14", 640, 480) == (476, 644)
-
-
 @pytest.mark.parametrize(
     ("size", "expected"),
     [
@@ -154,11 +144,6 @@ def test_versions_are_those_that_stored_descriptors_were_made_with() -> None:
     assert get_preprocessing("square224").as_spec() == {"name": "square224", "version": 1}
     for name, found in PREPROCESSINGS.items():
         assert found.as_spec()["name"] == name
-
-
-def test_only_the_services_own_ways_turn_photos_upright() -> None:
-    upright = {name for name, found in PREPROCESSINGS.items() if found.upright}
-    assert upright == {"area288x384", "square224", "square32"}
 
 
 @pytest.mark.parametrize(
