@@ -19,23 +19,20 @@ YES, NO = True, False
 # --- figures ---------------------------------------------------------------------------------
 
 
-def test_the_calibration_error_of_one_bin_is_the_gap_between_stated_and_true() -> None:
+def test_the_calibration_error_is_the_mean_gap_of_bins_of_equally_many() -> None:
+    """What one bin says too much does not make up for what another says too little."""
     assert expected_calibration_error([0.9] * 4, [YES, YES, YES, NO]) == pytest.approx(0.15)
     assert expected_calibration_error([0.25] * 4, [YES, NO, NO, NO]) == pytest.approx(0)
     assert expected_calibration_error([1.0], [NO]) == 1
     assert expected_calibration_error([0.5], [YES]) == 0.5
-
-
-def test_the_calibration_error_is_the_mean_over_bins_of_equally_many() -> None:
-    """Two bins of ten: what one says too much does not make up for what the other says too
-    little."""
     reported = [0.2] * 10 + [0.8] * 10
     truth = [YES] * 4 + [NO] * 6 + [YES] * 6 + [NO] * 4
     assert expected_calibration_error(reported, truth) == pytest.approx(0.2)
     mixed = [pair for both in zip(range(10), range(10, 20), strict=True) for pair in both]
-    assert expected_calibration_error(
+    mixed_error = expected_calibration_error(
         [reported[i] for i in mixed], [truth[i] for i in mixed]
-    ) == pytest.approx(0.2)
+    )
+    assert mixed_error == pytest.approx(0.2)
 
 
 # --- places ----------------------------------------------------------------------------------
@@ -44,51 +41,19 @@ DEGREE_M = 111_195.08
 metres_north = some.floats(0, 300)
 
 
-@pytest.mark.parametrize(
-    ("one", "other", "same"),
-    [
-        pytest.param(PhotoLocation(0, 0, None), PhotoLocation(0, 0, None), True, id="one spot"),
-        pytest.param(
-            PhotoLocation(0, 0, "a"),
-            PhotoLocation(50, 0, "a"),
-            True,
-            id="one label, far apart",
-        ),
-        pytest.param(
-            PhotoLocation(0, 0, "a"),
-            PhotoLocation(0, 0, "b"),
-            True,
-            id="two labels, one spot",
-        ),
-        pytest.param(
-            PhotoLocation(0, 0, "a"),
-            PhotoLocation(1, 0, "b"),
-            False,
-            id="two labels, two spots",
-        ),
-        pytest.param(
-            PhotoLocation(None, None, "a"),
-            PhotoLocation(None, None, "b"),
-            False,
-            id="two rooms",
-        ),
-        pytest.param(
-            PhotoLocation(None, None, "a"),
-            PhotoLocation(0, 0, None),
-            False,
-            id="incomparable",
-        ),
-        pytest.param(
-            PhotoLocation(None, None, None), PhotoLocation(0, 0, "a"), False, id="unknown"
-        ),
-        pytest.param(
-            PhotoLocation(None, None, None),
-            PhotoLocation(None, None, None),
-            False,
-            id="nothing",
-        ),
-    ],
-)
+PAIRS: dict[str, tuple[PhotoLocation, PhotoLocation, bool]] = {
+    "one spot": (PhotoLocation(0, 0, None), PhotoLocation(0, 0, None), True),
+    "one label, far apart": (PhotoLocation(0, 0, "a"), PhotoLocation(50, 0, "a"), True),
+    "two labels, one spot": (PhotoLocation(0, 0, "a"), PhotoLocation(0, 0, "b"), True),
+    "two labels, two spots": (PhotoLocation(0, 0, "a"), PhotoLocation(1, 0, "b"), False),
+    "two rooms": (PhotoLocation(None, None, "a"), PhotoLocation(None, None, "b"), False),
+    "incomparable": (PhotoLocation(None, None, "a"), PhotoLocation(0, 0, None), False),
+    "unknown": (PhotoLocation(None, None, None), PhotoLocation(0, 0, "a"), False),
+    "nothing": (PhotoLocation(None, None, None), PhotoLocation(None, None, None), False),
+}
+
+
+@pytest.mark.parametrize(("one", "other", "same"), PAIRS.values(), ids=PAIRS.keys())
 def test_which_photos_show_one_place(one: PhotoLocation, other: PhotoLocation, same: bool) -> None:
     for here, there in ((one, other), (other, one)):
         assert is_same_place(here, there, 25) == same
