@@ -179,12 +179,6 @@ def test_an_entry_that_is_no_extractor_is_refused_with_the_reason(
     assert message in refusal(folder, entry)
 
 
-def test_missing_packages_are_named(folder: Path) -> None:
-    hubconf = folder / "hubconf.py"
-    hubconf.write_text(hubconf.read_text().replace('["torch"]', '["torch", "no_such_package"]'))
-    assert "no_such_package" in refusal(folder, "colours")
-
-
 def test_code_of_others_prints_nothing_into_an_answer(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -194,17 +188,17 @@ def test_code_of_others_prints_nothing_into_an_answer(
     assert "printed by the code of others" in printed.err
 
 
-def test_a_missing_folder_is_an_error_with_the_three_ways(tmp_path: Path) -> None:
-    reported = refusal(tmp_path / "gone", "colours", "weights_missing")
-    assert f"there is no {tmp_path / 'gone' / 'hubconf.py'}" in reported
-    assert "placewise models fetch torchhub:" in reported
-
-
-def test_weights_that_can_not_be_downloaded_are_an_error_with_the_three_ways(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
+def test_missing_packages_folders_and_weights_are_errors_with_the_three_ways(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shared.descriptors.weight_files.RETRY_PAUSE_SECONDS", 0)
     assert "can't be downloaded" in refusal(folder, "from_network", "weights_missing")
+    hubconf = folder / "hubconf.py"
+    hubconf.write_text(hubconf.read_text().replace('["torch"]', '["torch", "no_such_package"]'))
+    assert "no_such_package" in refusal(folder, "colours")
+    reported = refusal(tmp_path / "gone", "colours", "weights_missing")
+    assert f"there is no {tmp_path / 'gone' / 'hubconf.py'}" in reported
+    assert "placewise models fetch torchhub:" in reported
 
 
 def test_a_repository_in_torch_hubs_folder_is_taken_without_the_network(

@@ -74,17 +74,10 @@ def test_progress_grows_to_its_end() -> None:
     assert {total for _, total in seen} == {seen[-1][0]}
 
 
-def test_few_points_give_few_clusters() -> None:
+def test_few_points_give_few_clusters_equal_ones_one_and_none_an_error() -> None:
     assert len(fit(unit_points(2, 4 * PATCHES_PER_CLUSTER - 1, 4), 64, 0)) == 3
     assert len(fit(unit_points(2, 7, 4), 64, 0)) == 1
-
-
-def test_equal_points_give_one_centre() -> None:
-    centres = fit(normalize(torch.ones(300, 4), dim=1), 5, 0)
-    assert centres.shape == (1, 4)
-
-
-def test_no_points_are_an_error_that_says_so() -> None:
+    assert fit(normalize(torch.ones(300, 4), dim=1), 5, 0).shape == (1, 4)
     with pytest.raises(Unprocessable) as caught:
         fit(torch.empty(0, 4), 8, 0)
     assert caught.value.code == "no_photos"

@@ -153,6 +153,9 @@ def test_published_tensors_of_a_resnet_are_loaded_as_the_network_that_they_belon
     assert published_name in tensors
     interpolation = "bicubic" if aggregator == "BoQ" else "bilinear"
     assert_loads_as(tmp_path / "published.pth", tensors, model, size, interpolation)
+    if aggregator == "CosPlace":  # also from a checkpoint of its training
+        state = {"model_state_dict": tensors, "epoch_num": 3}
+        assert_loads_as(tmp_path / "last_checkpoint.pth", state, model, size)
 
 
 @pytest.mark.parametrize(
@@ -193,18 +196,10 @@ def test_lightning_checkpoints_of_openvprlab_are_loaded_with_their_size_and_inte
     assert_loads_as(tmp_path / "epoch.ckpt", state, model, 288, "bicubic")
 
 
-@pytest.mark.parametrize(
-    "backbone",
-    [
-        "resnet34",
-        "resnet50",
-        "resnet101",
-        "resnet152",
-        "resnext50_32x4d",
-        "dinov2_vitb14",
-        "dinov2_vitl14",
-    ],
-)
+RECOGNISED = "resnet34 resnet50 resnet101 resnet152 resnext50_32x4d dinov2_vitb14 dinov2_vitl14"
+
+
+@pytest.mark.parametrize("backbone", RECOGNISED.split())
 def test_the_backbone_is_recognised_by_its_tensors(backbone: str) -> None:
     is_resnet = not backbone.startswith("dinov2")
     with torch.device("meta"):
@@ -247,12 +242,6 @@ def test_lightning_checkpoints_of_gsv_xs_are_loaded_with_their_hyperparameters(
     loaded = load_checkpoint(tmp_path / "theirs.ckpt")
     assert loaded.config.layers_to_freeze == -1  # its setting froze nothing
     assert loaded.about == {**training, "epoch": 29}
-
-
-def test_a_training_checkpoint_of_cosplace_is_loaded(tmp_path: Path) -> None:
-    model = make_model("resnet18", "CosPlace", {"out_dim": 8}, 64)
-    state = {"model_state_dict": rename(model, RESNET_OF_COSPLACE), "epoch_num": 3}
-    assert_loads_as(tmp_path / "last_checkpoint.pth", state, model, 512)
 
 
 @pytest.mark.parametrize(
