@@ -104,7 +104,9 @@ def test_an_expired_lease_that_no_one_took_over_still_holds(catalog: Catalog, ma
     assert end(catalog, jobs) == waiting
 
 
-def test_extending_moves_the_lease_of_its_token_alone(catalog: Catalog, map_id: UUID) -> None:
+def test_extending_moves_the_lease_of_its_token_alone_which_is_reclaimed_on_request_only(
+    catalog: Catalog, map_id: UUID
+) -> None:
     queue(catalog, map_id, 2, alone=True)
     mine, others = take(catalog), take(catalog)
     expire_lease(catalog, *ids(mine), *ids(others))
@@ -116,6 +118,9 @@ def test_extending_moves_the_lease_of_its_token_alone(catalog: Catalog, map_id: 
         assert not extend_lease(session, token_of(others), 60)
         assert not extend_lease(session, new_id(), 60)
     assert read_job(catalog, others[0].id).lease_until is None
+    assert free(catalog) == 0
+    assert free(catalog, all_leases=True) == 1
+    assert states(catalog, ids(mine) + ids(others)) == [JobState.QUEUED, JobState.QUEUED]
 
 
 def test_a_held_lease_is_extended_while_the_block_runs(catalog: Catalog, map_id: UUID) -> None:
@@ -178,17 +183,6 @@ def _failing_once(away: threading.Event) -> Any:
         return extend_lease(*arguments)
 
     return extend
-
-
-def test_leases_that_have_not_expired_are_reclaimed_on_request_only(
-    catalog: Catalog, map_id: UUID
-) -> None:
-    waiting = queue(catalog, map_id, 2)
-    take(catalog)
-    assert free(catalog) == 0
-    assert states(catalog, waiting) == [JobState.RUNNING, JobState.RUNNING]
-    assert free(catalog, all_leases=True) == 2
-    assert states(catalog, waiting) == [JobState.QUEUED, JobState.QUEUED]
 
 
 def test_jobs_of_a_crashed_batch_are_retried_alone_without_counting_an_attempt(

@@ -131,15 +131,14 @@ def test_failed_and_cancelled_jobs_start_anew_when_retried(catalog: Catalog, map
     assert ids(take(catalog)) == [job_id]
 
 
-def test_only_failed_and_cancelled_jobs_can_be_retried(catalog: Catalog, map_id: UUID) -> None:
+def test_only_failed_and_cancelled_jobs_can_be_retried_and_no_model_changes(
+    catalog: Catalog, map_id: UUID
+) -> None:
     for state in (JobState.QUEUED, JobState.RUNNING, JobState.SUCCEEDED):
         (job_id,) = queue(catalog, map_id, state=state)
         with pytest.raises(Conflict, match=state) as refused, catalog.write() as session:
             retry_job(session, session.get_one(Job, job_id))
         assert refused.value.code == "job_not_retryable"
-
-
-def test_a_model_change_is_started_anew_and_not_retried(catalog: Catalog, map_id: UUID) -> None:
     for kind in (*MODEL_CHANGE_JOBS, JobKind.REINDEX):
         (job_id,) = queue(catalog, map_id, kind=kind, state=JobState.FAILED)
         with pytest.raises(Conflict) as refused, catalog.write() as session:
