@@ -41,49 +41,39 @@ def port(catalog: Catalog, store: FolderStore, settings: Settings) -> OpenPort:
 
 class TestSearchWorker(SearchPortContract):
     def test_repaired_chunk_is_served_again_without_a_new_version(
-        self,
-        catalog: Catalog,
-        store: FolderStore,
-        settings: Settings,
-        monkeypatch: pytest.MonkeyPatch,
+        self, places: SmallMap, settings: Settings, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
-        places = SmallMap(catalog, store)
         places.add(unit_rows(1, 5))
         (key,) = places.chunk_keys()
-        whole = store.get(key)
-        store.put(key, damaged(whole, "flipped"))
-        worker = SearchWorker(catalog, store, settings)
+        whole = places.store.get(key)
+        places.store.put(key, damaged(whole, "flipped"))
+        worker = SearchWorker(places.catalog, places.store, settings)
         worker.sync()
         assert worker.status().missing == (key,)
-        store.put(key, whole)
+        places.store.put(key, whole)
         worker.sync()
         assert worker.status().missing == ()
         assert worker.status().rows == 5
 
     def test_damaged_chunk_is_not_read_again_with_every_look_and_every_new_version(
-        self,
-        catalog: Catalog,
-        store: FolderStore,
-        settings: Settings,
-        monkeypatch: pytest.MonkeyPatch,
+        self, places: SmallMap, settings: Settings, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(
             read_retries, "FIRST_RETRY_SECONDS", read_retries.MAX_DAMAGED_RETRY_SECONDS
         )
-        places = SmallMap(catalog, store)
         places.add(unit_rows(1, 5))
         (key,) = places.chunk_keys()
-        store.put(key, damaged(store.get(key), "flipped"))
+        places.store.put(key, damaged(places.store.get(key), "flipped"))
         opened: list[str] = []
-        open_object = store.open
+        open_object = places.store.open
 
         def counted(key: str) -> BinaryIO:
             opened.append(key)
             return open_object(key)
 
-        monkeypatch.setattr(store, "open", counted)
-        worker = SearchWorker(catalog, store, settings)
+        monkeypatch.setattr(places.store, "open", counted)
+        worker = SearchWorker(places.catalog, places.store, settings)
         for seed in (2, 3):
             worker.sync()
             worker.sync()
@@ -94,7 +84,7 @@ class TestSearchWorker(SearchPortContract):
 
     def test_chunk_that_is_truncated_while_it_is_mapped_is_left_out(
         self,
-        catalog: Catalog,
+        places: SmallMap,
         store: FolderStore,
         settings: Settings,
         monkeypatch: pytest.MonkeyPatch,
@@ -102,46 +92,43 @@ class TestSearchWorker(SearchPortContract):
         """Reading such a mapping would end the process. A deleted file is read on."""
         monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
         monkeypatch.setattr(worker_module, "FILE_CHECK_SECONDS", 0.0)
-        places = SmallMap(catalog, store)
         places.add(unit_rows(1, 5))
         retained = places.reference(places.add(unit_rows(2, 5))[0])[0]
         (key,) = set(places.chunk_keys()) - {retained}
         worker = SearchWorker(
-            catalog, store, settings.model_copy(update={"search_memory_bytes": 0})
+            places.catalog, places.store, settings.model_copy(update={"search_memory_bytes": 0})
         )
         worker.sync()
         assert worker.status().rows == 10
-        whole = store.get(key)
+        whole = places.store.get(key)
         os.truncate(store.path(key), 200)
-        store.delete(retained)
+        places.store.delete(retained)
         worker.sync()
         assert (worker.status().missing, worker.status().rows) == ((key,), 5)
-        store.put(key, whole)
+        places.store.put(key, whole)
         worker.sync()
         assert (worker.status().missing, worker.status().rows) == ((), 10)
 
     def test_following_forgets_what_is_no_longer_searched(
-        self, catalog: Catalog, store: FolderStore, settings: Settings
+        self, places: SmallMap, settings: Settings
     ) -> None:
-        places = SmallMap(catalog, store)
         places.add(unit_rows(1, 5))
-        worker = SearchWorker(catalog, store, settings)
+        worker = SearchWorker(places.catalog, places.store, settings)
         worker.sync()
         assert worker.status().versions == {places.generation_id: places.version}
-        with catalog.write() as session:
+        with places.catalog.write() as session:
             session.get_one(Generation, places.generation_id).state = GenerationState.RETIRED
         worker.sync()
         assert worker.status().versions == {}
         assert worker.status().resident_bytes == 0
 
     def test_followed_versions_reuse_the_chunks_that_are_loaded(
-        self, catalog: Catalog, store: FolderStore, settings: Settings
+        self, places: SmallMap, settings: Settings
     ) -> None:
-        places = SmallMap(catalog, store)
         first = places.add(unit_rows(1, 5))
-        worker = SearchWorker(catalog, store, settings)
+        worker = SearchWorker(places.catalog, places.store, settings)
         worker.sync()
-        store.delete(places.reference(first[0])[0])
+        places.store.delete(places.reference(first[0])[0])
         places.add(unit_rows(2, 5))
         worker.sync()
         assert worker.status().missing == (), "a loaded chunk was read again"
