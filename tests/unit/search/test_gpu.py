@@ -122,7 +122,7 @@ def test_only_new_chunks_are_copied_to_the_device(monkeypatch: pytest.MonkeyPatc
     assert hits_of(found) == brute_force(ROWS, QUERY, 5, EVERYTHING)
 
 
-def test_memory_of_merged_chunks_and_of_ended_generations_is_freed() -> None:
+def test_memory_of_merged_chunks_and_of_ended_or_coded_generations_is_freed() -> None:
     whole, rows = snapshot_of(ROWS, 3, coded=False), gpu_rows()
     rows.load(whole)
     assert rows.status().resident_bytes == ROWS.nbytes
@@ -131,13 +131,10 @@ def test_memory_of_merged_chunks_and_of_ended_generations_is_freed() -> None:
     assert not is_loaded(whole, rows)
     rows.release([whole.generation_id])
     assert rows.status().resident_bytes == 0
-
-
-def test_generation_that_gets_sign_codes_leaves_the_device() -> None:
-    rows = gpu_rows()
-    rows.load(plain := snapshot_of(ROWS, coded=False))
-    rows.load(replace(snapshot_of(ROWS), generation_id=plain.generation_id))
-    assert rows.status().generations == ()
+    rows.load(whole)
+    assert rows.status().generations == (whole.generation_id,)
+    rows.load(replace(snapshot_of(ROWS), generation_id=whole.generation_id))
+    assert rows.status().generations == (), "it has sign codes now"
 
 
 @pytest.mark.parametrize("retry_seconds", [0.0, gpu.RETRY_SECONDS])
@@ -187,7 +184,7 @@ def test_dense_mode_never_asks_the_device(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.parametrize("sees_driver", [False, True])
-def test_without_a_gpu_search_uses_the_cpu_or_says_what_is_missing(
+def test_without_a_gpu_or_pytorch_search_uses_the_cpu_or_says_what_is_missing(
     monkeypatch: pytest.MonkeyPatch, sees_driver: bool, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
@@ -199,9 +196,6 @@ def test_without_a_gpu_search_uses_the_cpu_or_says_what_is_missing(
     assert open_search_gpu("cpu") is None
     with pytest.raises(Misconfigured, match="no CUDA device"):
         open_search_gpu("cuda")
-
-
-def test_without_pytorch_search_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert open_search_gpu("auto") is None
     with pytest.raises(Misconfigured, match="search-gpu"):
