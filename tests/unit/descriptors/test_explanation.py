@@ -141,9 +141,6 @@ def test_overlay_has_a_pixel_for_each_patch_and_is_clear_where_nothing_is_added(
     assert pixels[..., 3].tolist() == [[255, 0, 128], [64, 0, 0]]
     assert tuple(pixels[0, 0, :3]) == POSITIVE_COLOUR
     assert tuple(pixels[0, 2, :3]) == NEGATIVE_COLOUR
-
-
-def test_overlay_of_nothing_is_clear() -> None:
     overlay, full = draw_overlay(np.zeros((3, 4)))
     assert full == 0
     assert not pixels_of(overlay)[..., 3].any()

@@ -121,13 +121,16 @@ AGGREGATIONS: dict[str, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]] = 
 
 
 @pytest.mark.parametrize("options", AGGREGATIONS)
-def test_the_aggregator_of_the_name_is_at_work(options: str) -> None:
+def test_the_aggregator_of_the_name_is_at_work_with_its_vocabulary(options: str) -> None:
     made = chosen(options)
     array = np.random.default_rng(2).standard_normal((5, 16)).astype(np.float32)
     centres = parse_centres(array) if made.config.needs_vocabulary else None
     photos = np.random.default_rng(3).integers(0, 256, (2, 32, 32, 3), dtype=np.uint8)
     expected = AGGREGATIONS[options](made.features(photos), torch.from_numpy(array))
     assert np.array_equal(made.describe(photos, centres), expected.numpy())
+    if made.config.needs_vocabulary:
+        with pytest.raises(ValueError, match="needs a vocabulary"):
+            made.describe(photos, None)
 
 
 @pytest.mark.parametrize("options", AGGREGATIONS)
@@ -171,11 +174,6 @@ def test_photos_of_one_size_pass_together_and_of_large_ones_fewer(
     assert [len(one) for one in local] == [height * width // 16 for height, width in shapes]
     for photo, one in zip(photos, local, strict=True):
         np.testing.assert_allclose(made.features(photo[None])[0], one, atol=1e-6)
-
-
-def test_vlad_without_a_vocabulary_is_refused(tiny: Extractor) -> None:
-    with pytest.raises(ValueError, match="needs a vocabulary"):
-        tiny.describe(np.zeros((1, 32, 32, 3), dtype=np.uint8), None)
 
 
 def test_features_are_the_stride_16_map_of_a_network_that_recognises_a_daisy(

@@ -122,16 +122,10 @@ def test_kept_features_are_what_was_compared() -> None:
     assert len(photo.encode()) < 4 * 6 * WIDTH * 2 + 200
 
 
-@pytest.mark.parametrize(
-    "data",
-    [b"", b"\x93NUMPY\x01\x00", scene(0, 2, 2).encode()[:-3], b"PK\x03\x04"],
-    ids=["empty", "a header's begin", "cut off", "an archive"],
-)
-def test_damaged_features_are_noticed(data: bytes) -> None:
-    with pytest.raises(ValueError, match="not a NumPy array"):
-        LocalFeatures.decode(data, WIDTH)
-
-
-def test_features_of_another_network_are_noticed() -> None:
+def test_damaged_features_and_those_of_another_network_are_noticed() -> None:
+    cut_off = scene(0, 2, 2).encode()[:-3]
+    for data in (b"", b"\x93NUMPY\x01\x00", cut_off, b"PK\x03\x04"):
+        with pytest.raises(ValueError, match="not a NumPy array"):
+            LocalFeatures.decode(data, WIDTH)
     with pytest.raises(ValueError, match="not float16"):
         LocalFeatures.decode(scene().encode(), WIDTH + 1)

@@ -22,18 +22,14 @@ def walk(points: torch.Tensor, centres: torch.Tensor, batch: int) -> KMeansPass:
     return one
 
 
-def test_seeds_are_points_and_all_different() -> None:
+def test_seeds_are_points_and_all_different_while_there_are_enough() -> None:
     points = unit_points(3, 50, 4)
     seeds = choose_seeds(points, 20, seed=1)
     rows = {tuple(point.tolist()) for point in points}
     assert {tuple(seed.tolist()) for seed in seeds} <= rows
     assert len({tuple(seed.tolist()) for seed in seeds}) == 20
     assert not torch.equal(seeds, choose_seeds(points, 20, seed=2))
-
-
-def test_more_seeds_than_distinct_points_repeat_them() -> None:
-    points = unit_points(9, 3, 4)
-    assert choose_seeds(points, 6, seed=0).shape == (6, 4)
+    assert choose_seeds(unit_points(9, 3, 4), 6, seed=0).shape == (6, 4)
 
 
 def test_a_pass_ends_with_plain_means_that_are_not_normalised_again() -> None:
