@@ -57,29 +57,21 @@ def contents(folder: Path) -> dict[str, str]:
     }
 
 
-def test_answer_counts_what_lies_on_disk(city: dict[str, Any], out: Path) -> None:
+def test_a_city_has_the_photos_that_are_counted_their_kinds_and_the_requested_size(
+    city: dict[str, Any], out: Path
+) -> None:
     assert city["counts"] == {"database": 48, "query": 10, "train": 48}
     assert city["query_kinds"] == {"in_map": 8, "other_way": 1, "out_of_map": 1}
     assert city["note"] == NOTE
     assert city["ladder"] == []
     assert city["drawing"]["photos_per_second"] > 0
-    assert len(list((out / "database").iterdir())) == 48
-    assert len(list((out / "queries").iterdir())) == 10
-
-
-def test_every_photo_has_a_name_of_the_convention_and_the_requested_size(out: Path) -> None:
     photos = list(out.rglob("*.jpg"))
     assert len(photos) == 48 + 10 + 48
     for path in photos:
-        assert utm_position_of_file_name(path.name) is not None
         fields = upload_fields_of_file_name(path.name, None)
         assert set(fields) == {"latitude", "longitude", "heading", "captured_at"}
         with Image.open(path) as image:
-            assert image.size == (96, 72)
-            assert image.format == "JPEG"
-
-
-def test_city_json_has_every_argument_and_the_kind_of_each_query(out: Path) -> None:
+            assert (image.size, image.format) == ((96, 72), "JPEG")
     about = json.loads((out / "city.json").read_text())
     assert about["note"] == NOTE
     assert about["arguments"] == {
@@ -94,6 +86,7 @@ def test_city_json_has_every_argument_and_the_kind_of_each_query(out: Path) -> N
         "train": True,
         "ride_frames": 0,
     }
+    assert len(list((out / "database").iterdir())) == 48
     assert set(about["queries"]) == {path.name for path in (out / "queries").iterdir()}
     kinds = [query["kind"] for query in about["queries"].values()]
     assert sorted(kinds) == ["in_map"] * 8 + ["other_way", "out_of_map"]
@@ -163,14 +156,7 @@ def test_folder_that_cannot_be_made_is_an_error_that_names_it(command: Command, 
     assert "city.json" in problem["detail"]
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        ("--places", "0"),
-        ("--out-of-map", "1.5"),
-        ("--size", "9999x10"),
-    ],
-)
+@pytest.mark.parametrize("wrong", [("--places", "0"), ("--size", "9999x10")])
 def test_impossible_numbers_are_refused_before_anything_is_written(
     command: Command, wrong: tuple[str, str]
 ) -> None:

@@ -245,13 +245,10 @@ def test_a_fast_dev_run_leaves_nothing(places: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("others", "code", "expected"),
     [
-        ({"val_set_names": "sfxs_vla"}, "set_missing", "no set 'sfxs_vla'"),
         ({"cities": "Nowhere"}, "city_missing", "Nowhere"),
         ({"backbone_arch": "resnet19"}, "unknown_backbone", "resnet18"),
-        ({"agg_arch": "mean"}, "unknown_aggregator", "CosPlace"),
         ({"monitor": "other/R1"}, "unknown_metric", "known: "),
         ({"img_per_place": 4}, "bad_argument", "min_img_per_place"),
-        ({"pretrained": True, "weights": "nowhere.pth"}, "weights_missing", "(--weights)"),
     ],
 )
 def test_what_is_not_there_is_named_with_what_is_known(

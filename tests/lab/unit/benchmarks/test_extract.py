@@ -30,10 +30,3 @@ def test_random_weights_are_named_and_the_passes_to_the_used_layer_counted(
     assert found["CPU time of a photo, batches of 2"] > 0
     # Of block 0 and what block 1 is needed for, with 257 tokens: between one block and three.
     assert 0.9 < found["forward pass of a photo"] < 3.0
-
-
-@pytest.mark.parametrize(("option", "value"), [("--precision", "float16"), ("--device", "tpu")])
-def test_what_is_not_known_is_refused(option: str, value: str) -> None:
-    ended = runner.invoke(app, ["bench", "extract", option, value])
-    assert ended.exit_code == 2
-    assert value in ended.output

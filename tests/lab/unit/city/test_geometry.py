@@ -13,7 +13,7 @@ from lab.city.camera import Camera, cast_rays
 from lab.city.plan import CityOptions, CityPlan, PlannedPhoto, make_plan
 from lab.city.raster import SUPERSAMPLING
 from lab.city.scene import CityStyle, Scene
-from lab.city.sessions import NIGHT, SESSIONS, SUMMER
+from lab.city.sessions import NIGHT, SUMMER
 from lab.city.streets import Quarter
 
 OPTIONS = CityOptions(
@@ -170,9 +170,3 @@ def test_no_camera_stands_in_a_house(plan: CityPlan) -> None:
         across = across - away[:, 1] * quarter.side_directions[:, 0]
         blocks = across.reshape(-1, 4)  # a block has four sides; inside all of them is inside
         assert not (blocks > 0).all(axis=1).any()
-
-
-def test_sessions_lie_days_apart_and_have_names_of_their_own() -> None:
-    days = sorted(session.starts_at.date() for session in SESSIONS)
-    assert all((later - earlier).days >= 2 for earlier, later in pairwise(days))
-    assert len({session.name for session in SESSIONS}) == len(SESSIONS)

@@ -29,22 +29,18 @@ def positions(shots: list[PlannedPhoto]) -> np.ndarray[tuple[int, int], np.dtype
     return np.array([(shot.camera.x, shot.camera.y) for shot in shots])
 
 
-def test_each_place_has_its_views_and_there_are_as_many_queries_as_requested(
+def test_each_place_has_its_views_and_queries_are_as_many_of_each_kind_as_requested(
     plan: CityPlan,
 ) -> None:
     views = Counter(shot.place for shot in of_role(plan, "database"))
     assert set(views) == set(range(150))
     assert set(views.values()) == {4}
-    assert len(of_role(plan, "query")) == 120
-
-
-def test_out_of_map_queries_are_the_requested_share(plan: CityPlan) -> None:
     kinds = Counter(shot.kind for shot in of_role(plan, "query"))
     assert kinds == {"in_map": 88, "other_way": 8, "out_of_map": 24}
 
 
-@pytest.mark.parametrize(("share", "expected"), [(0.0, 0), (0.5, 60), (1.0, 120)])
-def test_share_out_of_map_may_be_anything_from_none_to_all(share: float, expected: int) -> None:
+@pytest.mark.parametrize(("share", "expected"), [(0.0, 0), (1.0, 120)])
+def test_no_query_or_every_query_may_be_out_of_the_map(share: float, expected: int) -> None:
     options = CityOptions(20, 2, 120, 0, 0, share, 64, 64)
     shots = of_role(make_plan(options), "query")
     assert sum(shot.kind == "out_of_map" for shot in shots) == expected
@@ -106,11 +102,3 @@ def test_name_says_where_and_when_the_camera_stood(plan: CityPlan) -> None:
         fields = upload_fields_of_file_name(shot.name, None)
         assert float(fields["heading"]) == pytest.approx(shot.camera.yaw, abs=0.006)
         assert fields["captured_at"].startswith(shot.session.starts_at.date().isoformat())
-
-
-def test_same_arguments_give_the_same_plan_and_another_seed_another(plan: CityPlan) -> None:
-    again = make_plan(OPTIONS)
-    assert [shot.name for shot in again.photos] == [shot.name for shot in plan.photos]
-    assert again.photos == plan.photos
-    other = make_plan(CityOptions(150, 4, 120, 6, 0, 0.2, 64, 64))
-    assert not {shot.name for shot in other.photos} & {shot.name for shot in plan.photos}

@@ -35,10 +35,7 @@ def test_front_holds_what_nothing_beats_in_price_and_worth() -> None:
     worths = [0.5, 0.7, 0.6, 0.7, 0.9, 1.0]
     # dearer and worse than the second; as good and dearer; not measured
     assert pareto_front(prices, worths) == [True, True, False, False, True, False]
-
-
-def test_equal_ones_are_both_on_the_front() -> None:
-    assert pareto_front([1.0, 1.0], [0.5, 0.5]) == [True, True]
+    assert pareto_front([1.0, 1.0], [0.5, 0.5]) == [True, True], "neither beats the other"
 
 
 def test_equal_charts_have_equal_bytes_and_their_labels_are_text() -> None:

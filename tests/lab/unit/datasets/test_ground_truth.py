@@ -79,11 +79,9 @@ def test_positive_is_within_25_metres_the_bound_included() -> None:
     ("text", "rule"),
     [
         ("radius", PositiveRule("radius", radius_m=25)),
-        ("radius 10", PositiveRule("radius", radius_m=10)),
         ("Radius 2.5 m", PositiveRule("radius", radius_m=2.5)),
         ("radius:25m", PositiveRule("radius", radius_m=25)),
         ("heading", PositiveRule("heading", radius_m=25, degrees=40)),
-        ("heading 25 m 40 deg", PositiveRule("heading", radius_m=25, degrees=40)),
         ("heading 10 30", PositiveRule("heading", radius_m=10, degrees=30)),
         ("frames 5", PositiveRule("frames", frames=5)),
         ("frames 2 in sequence", PositiveRule("frames", frames=2, same_sequence=True)),
@@ -105,15 +103,6 @@ def test_letters_of_one_zone_are_one_plane_and_other_zones_are_another_place() -
     queries = [at(480_000, 5_318_000, "32T")]
     database = [at(480_000, 5_318_020, "32U"), at(480_000, 5_318_000, "33T")]
     assert positives("radius", queries, database) == [[0]]
-
-
-def test_photos_next_to_each_other_over_a_zones_border_are_positives() -> None:
-    # 12 degrees east parts the zones 32 and 33; one ten-thousandth of a degree is 7 m here.
-    queries = [on_earth(48.0, 11.9999), on_earth(48.0, 12.0001)]
-    database = [on_earth(48.0, 12.0002), on_earth(48.0, 11.9996), on_earth(48.0, 12.0020)]
-    assert [one.zone for one in queries] == ["32U", "33U"]
-    assert positives("radius 25", queries, database) == [[0, 1], [0]]
-    assert positives("radius 40", queries, database) == [[0, 1], [0, 1]]
 
 
 def test_equator_and_antimeridian_part_no_neighbours() -> None:

@@ -132,7 +132,6 @@ def test_an_own_backbone_is_frozen_as_a_whole_and_gets_the_choice_of_weights() -
         ({"agg_arch": "nowhere:Strongest"}, "ModuleNotFoundError"),
         ({"agg_arch": "broken:Strongest"}, "nothing_of_that_name"),
         ({"backbone_arch": "walks:not_callable"}, "not a class or function"),
-        ({"backbone_arch": "walks:"}, "AttributeError"),
     ],
 )
 def test_own_code_that_can_not_be_used_is_named_with_the_reason(
