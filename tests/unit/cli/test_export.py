@@ -90,7 +90,6 @@ def test_a_map_without_queries_pairs_its_own_photos_but_those_without_a_descript
     ("photos", "names", "remedy"),
     [
         (("a.jpg", "a.jpg"), "filename", "--names path or --names id."),
-        (("a b.jpg",), "filename", "by ID: --names id."),
         (("a b.jpg",), "path", "by ID: --names id."),
     ],
 )

@@ -56,8 +56,10 @@ def test_name_with_its_own_zone_goes_before_the_option(zone: str | None) -> None
     assert "heading" not in fields
 
 
-@pytest.mark.parametrize("name", [f"@{EAST}@{NORTH}@.jpg", f"@{EAST}@{NORTH}@@@@@@@@@@@@@.jpg"])
-@pytest.mark.parametrize("zone", ["32T", "32t"])
+@pytest.mark.parametrize(
+    ("name", "zone"),
+    [(f"@{EAST}@{NORTH}@.jpg", "32T"), (f"@{EAST}@{NORTH}@@@@@@@@@@@@@.jpg", "32t")],
+)
 def test_name_without_a_zone_takes_the_option(name: str, zone: str) -> None:
     fields = upload_fields_of_file_name(name, zone)
     assert float(fields["latitude"]) == pytest.approx(LATITUDE, abs=1e-3)
@@ -77,8 +79,6 @@ def test_name_without_any_zone_is_an_error_that_names_the_option() -> None:
         f"@east@{NORTH}@32@T@@@@@@@@@@@.jpg",
         f"@{EAST}@{NORTH}@99@T@@@@@@@@@@@.jpg",
         f"@{EAST}@{NORTH}@32@I@@@@@@@@@@@.jpg",
-        f"@9{EAST}@{NORTH}@32@T@@@@@@@@@@@.jpg",
-        f"@{EAST}@{NORTH}@thirty-two@T@@@@@@@@@@@.jpg",
     ],
 )
 def test_coordinates_that_are_none_are_an_error_that_names_the_file(name: str) -> None:
@@ -131,18 +131,17 @@ def test_folder_without_photos_is_an_error(tmp_path: Path) -> None:
     assert refused(tmp_path).code == "no_photos"
 
 
-def test_table_says_what_is_known_of_each_photo(tmp_path: Path) -> None:
+def test_table_with_a_byte_order_mark_says_what_is_known_of_each_photo(tmp_path: Path) -> None:
     make(tmp_path, "a.jpg", "in/b.jpg", "c.jpg")
     table = table_of(
         tmp_path,
-        "filename,latitude,longitude,place,tags\n"
-        'a.jpg,45.1,7.6,,"night,rain"\n'
-        "in/b.jpg,,,corridor,\n",
+        'filename,latitude,longitude,place,tags\na.jpg,45.1,7.6,,"night,rain"\nin/b.jpg,,,Café,\n',
+        encoding="utf-8-sig",
     )
     found = {photo.path.name: photo.fields for photo in find_photos(tmp_path, table, None)}
     assert found == {
         "a.jpg": {"latitude": "45.1", "longitude": "7.6", "tags": "night,rain"},
-        "b.jpg": {"place": "corridor"},
+        "b.jpg": {"place": "Café"},
         "c.jpg": {},
     }
 
@@ -154,15 +153,6 @@ def test_table_goes_before_the_name(tmp_path: Path) -> None:
     assert find_photos(tmp_path, table, None)[0].fields == {"latitude": "1", "longitude": "2"}
 
 
-@pytest.mark.parametrize("column", ["filename", "file", "path"])
-def test_table_with_a_byte_order_mark_and_any_of_three_names_of_a_column_is_read(
-    tmp_path: Path, column: str
-) -> None:
-    make(tmp_path, "a.jpg")
-    table = table_of(tmp_path, f"{column},place\na.jpg,Café\n", encoding="utf-8-sig")
-    assert find_photos(tmp_path, table, None)[0].fields == {"place": "Café"}
-
-
 def test_table_that_names_a_missing_photo_is_an_error_with_its_line(tmp_path: Path) -> None:
     make(tmp_path, "a.jpg")
     table = table_of(tmp_path, 'filename,place\na.jpg,"two\nlines"\n\nmissing.jpg,hall\n')
@@ -170,6 +160,7 @@ def test_table_that_names_a_missing_photo_is_an_error_with_its_line(tmp_path: Pa
     assert error.code == "bad_table"
     assert "line 5" in error.detail
     assert "missing.jpg" in error.detail
+    assert refused(tmp_path, tmp_path / "nothing.csv").code == "bad_table"
 
 
 def test_short_line_is_an_error_with_its_line(tmp_path: Path) -> None:
@@ -177,10 +168,3 @@ def test_short_line_is_an_error_with_its_line(tmp_path: Path) -> None:
     error = refused(tmp_path, table_of(tmp_path, "place,filename\nhall\n"))
     assert error.code == "bad_table"
     assert "line 2" in error.detail
-
-
-def test_table_in_another_encoding_or_missing_is_an_error(tmp_path: Path) -> None:
-    make(tmp_path, "a.jpg")
-    table = table_of(tmp_path, "filename,place\na.jpg,Café\n", encoding="latin-1")
-    assert refused(tmp_path, table).code == "bad_table"
-    assert refused(tmp_path, tmp_path / "nothing.csv").code == "bad_table"

@@ -158,19 +158,6 @@ def test_weights_are_fetched_ahead_of_time(server: FilesServer, vits_weights: by
     assert len(server.requests) == count, "a file that is present is not requested again"
 
 
-def test_an_interrupted_fetch_goes_on_where_it_ended(
-    server: FilesServer, vits_weights: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(weight_files, "MAX_DOWNLOAD_ATTEMPTS", 1)
-    server.break_after = [5_000_000]
-    refused = command("fetch", VITS, exit_code=1)
-    assert refused["code"] == "weights_missing"
-    server.requests.clear()
-    fetched = command("fetch", VITS)
-    assert Path(fetched["path"]).read_bytes() == vits_weights
-    assert server.requests == [(VITS_FILE, "bytes=5000000-")]
-
-
 def test_a_file_that_is_not_what_the_hub_promises_is_refused(
     server: FilesServer, caches: Path, vits_weights: bytes
 ) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -153,8 +152,3 @@ def test_an_answer_without_levels_has_neither_bars_nor_match_probabilities(tmp_p
     assert "probability" not in shown
     assert "match" not in shown
     assert "certainty" not in path
-
-
-def test_the_output_names_the_map_and_the_server(tmp_path: Path) -> None:
-    shown, _ = query(tmp_path, estimate(PLACES), "--map", "annex")
-    assert re.search(r"^Searched map annex of http://127\.0\.0\.1:\d+$", shown, re.MULTILINE)

@@ -172,12 +172,17 @@ def test_a_sidecar_with_coordinates_counts_as_coordinates_of_the_photo(folder: P
     assert proposals(folder).keys() == {"day 1/2.jpg"}
 
 
-def test_nothing_is_written_unless_it_is_requested(folder: Path) -> None:
+def test_proposals_are_listed_and_nothing_is_written_unless_it_is_requested(folder: Path) -> None:
     before = contents(folder)
     result = run(folder)
     assert result.exit_code == 0
     assert "Nothing is written" in result.stderr
     assert contents(folder) == before
+    rows = [line.split("\t") for line in result.stdout.splitlines()]
+    assert rows[0] == ["photo", "latitude", "longitude", "within", "prob.", "reason"]
+    assert rows[1][0] == "4.jpg"
+    assert rows[1][5] == "nothing is known about its place"
+    assert rows[2][3:] == ["100 m", rows[2][4], "taken 20 s after 1.jpg"]
 
 
 def test_sidecars_are_written_for_accepted_proposals_and_undone(folder: Path) -> None:
@@ -520,11 +525,3 @@ def test_a_photo_that_is_changed_while_its_exif_is_written_keeps_the_change(
     result = run(folder, "--write", "exif")
     assert (result.exit_code, "changed the file meanwhile" in result.stderr) == (1, True)
     assert photo_file.read_bytes() == photo(20, camera="edited")
-
-
-def test_the_table_is_tab_separated_without_a_terminal(folder: Path) -> None:
-    rows = [line.split("\t") for line in run(folder).stdout.splitlines()]
-    assert rows[0] == ["photo", "latitude", "longitude", "within", "prob.", "reason"]
-    assert rows[1][0] == "4.jpg"
-    assert rows[1][5] == "nothing is known about its place"
-    assert rows[2][3:] == ["100 m", rows[2][4], "taken 20 s after 1.jpg"]
