@@ -1,11 +1,10 @@
-"""Positions and times in @UTM@ file names."""
+"""Times in @UTM@ file names."""
 
 from __future__ import annotations
 
 import pytest
 
-from shared.errors import InvalidRequest
-from shared.utm_filenames import upload_fields_of_file_name, utm_position_of_file_name
+from shared.utm_filenames import upload_fields_of_file_name
 
 
 def stamped(timestamp: str) -> str:
@@ -27,16 +26,3 @@ def test_full_date_becomes_the_time_of_capture(timestamp: str, expected: str) ->
 @pytest.mark.parametrize("timestamp", ["", "2019", "201905", "20191301", "2019050125", "yesterday"])
 def test_shorter_or_impossible_timestamp_is_left_alone(timestamp: str) -> None:
     assert "captured_at" not in upload_fields_of_file_name(stamped(timestamp), None)
-
-
-def test_position_is_the_two_first_fields() -> None:
-    assert utm_position_of_file_name(stamped("")) == (396877.76, 4991561.25)
-    assert utm_position_of_file_name("@1.5@2.5@.jpg") == (1.5, 2.5)
-    assert utm_position_of_file_name("photo.jpg") is None
-
-
-def test_position_that_is_no_number_names_the_file() -> None:
-    with pytest.raises(InvalidRequest) as caught:
-        utm_position_of_file_name("@east@2@.jpg")
-    assert caught.value.code == "bad_coordinates"
-    assert "@east@2@.jpg" in caught.value.detail
