@@ -111,7 +111,6 @@ def test_a_file_of_rows_is_enough(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("rows", "arguments", "code", "message"),
     [
-        (unit_rows(), ["--dimension", "17"], "pca_too_many_dimensions", "16"),
         (unit_rows(4), ["--dimension", "4"], "pca_too_few_rows", "there are 4"),
         (2 * unit_rows(), [], "bad_rows", "Row 0 has the L2 norm 2"),
         (np.arange(12).reshape(3, 4), [], "bad_rows", "floating point"),
