@@ -115,12 +115,6 @@ def test_the_examples_have_every_kind_of_resource() -> None:
     assert kinds >= {*CUSTOM, *WORKLOADS, "Ingress", "PersistentVolumeClaim", "NetworkPolicy"}
 
 
-def test_the_chart_has_the_version_of_the_release() -> None:
-    chart = yaml.safe_load((CHART / "Chart.yaml").read_text())
-    pyproject = (ROOT / "pyproject.toml").read_text()
-    assert f'version = "{chart["appVersion"]}"' in pyproject
-
-
 def test_the_schema_knows_every_value_and_refuses_others() -> None:
     values = yaml.safe_load((CHART / "values.yaml").read_text())
     schema = json.loads((CHART / "values.schema.json").read_text())
