@@ -46,20 +46,17 @@ def searchable(page: Page, town: Town) -> int:
     return int(answer["searchable"])
 
 
-def test_each_photo_is_watched_until_it_can_be_found(page: Page, town: Town) -> None:
-    add(page, photo(1), photo(2))
+def test_each_photo_but_hidden_ones_is_watched_until_it_can_be_found(
+    page: Page, town: Town
+) -> None:
+    add(page, {**photo(1), "name": "._1.jpg"}, photo(1), photo(2))
     expect(page.locator(".queue-row.done .state")).to_have_text(["Searchable", "Searchable"])
+    expect(page.locator(".queue-row")).to_have_count(2)
     expect(page.locator(".summary h2")).to_have_text("2 photos added")
     assert searchable(page, town) == 2
     add(page, photo(2))
     expect(page.locator(".queue-row.done")).to_have_count(3)
     expect(page.get_by_text("the map had it already")).to_be_visible()
-
-
-def test_hidden_files_are_skipped(page: Page, town: Town) -> None:
-    add(page, {**photo(1), "name": "._1.jpg"}, photo(1))
-    expect(page.locator(".queue-row.done .queue-name")).to_have_text(["1.jpg"])
-    expect(page.locator(".queue-row")).to_have_count(1)
 
 
 def test_a_refused_file_is_named_with_the_reason_and_the_others_go_on(
@@ -138,7 +135,11 @@ def archive(name: str, data: bytes) -> FilePayload:
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
-def test_the_photos_of_a_zip_keep_their_paths(page: Page, town: Town, method: int) -> None:
+def test_the_photos_of_a_zip_keep_their_paths_and_get_the_details(
+    page: Page, town: Town, method: int
+) -> None:
+    page.get_by_text("Details for these photos").click()
+    page.get_by_label("Tags").fill("north")
     photos = {f"hall/{number} ü.jpg": photo_bytes(number) for number in range(3)}
     others = {"hall/notes.txt": b"", "__MACOSX/._0.jpg": b"", "hall/photos.csv": b"filename\n"}
     add(page, archive("h.zip", zip_of({**photos, **others, "empty/": b""}, method)))
@@ -147,17 +148,8 @@ def test_the_photos_of_a_zip_keep_their_paths(page: Page, town: Town, method: in
     expect(page.get_by_text("hall/photos.csv of h.zip is not read here")).to_be_visible()
     assert searchable(page, town) == 3
     name = page.evaluate("localStorage.getItem('placewise-map')")
-    images = town.get("/search", map=name)["images"]
+    images = town.get("/search", map=name, tags="north")["images"]
     assert {image["relative_path"] for image in images} == set(photos)
-
-
-def test_details_hold_for_the_photos_of_a_zip(page: Page, town: Town) -> None:
-    page.get_by_text("Details for these photos").click()
-    page.get_by_label("Tags").fill("north")
-    add(page, archive("h.zip", zip_of({"1.jpg": photo_bytes(1), "2.jpg": photo_bytes(2)})))
-    expect(page.locator(".queue-row.done .state")).to_have_text("2 photos added")
-    name = page.evaluate("localStorage.getItem('placewise-map')")
-    assert town.get("/search", map=name, tags="north")["total_found"] == 2
 
 
 def test_an_archive_that_the_page_can_not_read_says_what_to_do(page: Page) -> None:

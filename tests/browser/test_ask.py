@@ -15,7 +15,11 @@ from playwright.sync_api import Page, Route, expect
 from tests.browser.conftest import Town, Visitor
 
 
-def ask(visitor: Visitor, photo: Path) -> Page:
+def ask(visitor: Visitor, photo: Path, answer: Any = None) -> Page:
+    """Ask with a photo; `answer` is what the API answers then, instead of its own."""
+    if answer is not None:
+        similarity = "**/api/v1/similarity?*"
+        visitor.page.route(similarity, lambda route: route.fulfill(json=answer))
     page = visitor.visit("ask")
     page.locator("input[data-use=ask]").set_input_files(photo)
     expect(page.locator(".verdict")).to_be_visible()
@@ -94,8 +98,10 @@ PATHS = [
     {**UNPLACED, "place": "tower/floor 7", "probability": 0.97},
 ]
 SURE_PATHS = [PATHS[0] | {"probability": 0.96}, PATHS[1]]
-
-
+UNSURE_PATHS = [PATHS[0], PATHS[1] | {"probability": 0.9}]
+CIRCLE, FLOOR, LIFT = "45.07000, 7.68000 ± 42 m (68 %)", "tower/floor 7", "tower/floor 7/elevator"
+SURE, UNSURE = (f"{share} % sure it is in “tower/floor 7”" for share in (97, 90))
+NO_PHOTO = "62 % sure that this map has no photo of the place."
 UNCLEAR = "it is not clear whether the place is in this map"
 ELSEWHERE = (
     "The matches point to one place no more clearly than those of a photo from elsewhere do."
@@ -106,69 +112,13 @@ FINER = "A finer answer needs clearer signs that the place is in this map."
 @pytest.mark.parametrize(
     ("levels", "answer", "outside", "has_place", "title", "place", "reason"),
     [
-        (
-            CIRCLES,
-            1,
-            0.02,
-            True,
-            "In this map",
-            "45.07000, 7.68000 ± 42 m (68 %)",
-            "97 % sure it is within 100 m.",
-        ),
-        (
-            PATHS,
-            1,
-            0.02,
-            True,
-            "In this map",
-            "tower/floor 7",
-            "97 % sure it is in “tower/floor 7”.",
-        ),
-        (
-            [PATHS[0], PATHS[1] | {"probability": 0.9}],
-            None,
-            0.2,
-            True,
-            "Best guess",
-            "tower/floor 7/elevator",
-            "90 % sure it is in “tower/floor 7”: an answer needs 95 %.",
-        ),
-        (
-            PATHS,
-            None,
-            0.2,
-            True,
-            "Best guess",
-            "tower/floor 7/elevator",
-            f"97 % sure it is in “tower/floor 7”, but {UNCLEAR}.",
-        ),
-        (
-            SURE_PATHS,
-            1,
-            0.02,
-            True,
-            "In this map",
-            "tower/floor 7",
-            f"97 % sure it is in “tower/floor 7”. {FINER}",
-        ),
-        (
-            CIRCLES,
-            None,
-            0.62,
-            False,
-            "Not in this map",
-            None,
-            "62 % sure that this map has no photo of the place.",
-        ),
-        (
-            CIRCLES,
-            None,
-            0.2,
-            False,
-            "Probably not in this map",
-            None,
-            ELSEWHERE,
-        ),
+        (CIRCLES, 1, 0.02, True, "In this map", CIRCLE, "97 % sure it is within 100 m."),
+        (PATHS, 1, 0.02, True, "In this map", FLOOR, f"{SURE}."),
+        (UNSURE_PATHS, None, 0.2, True, "Best guess", LIFT, f"{UNSURE}: an answer needs 95 %."),
+        (PATHS, None, 0.2, True, "Best guess", LIFT, f"{SURE}, but {UNCLEAR}."),
+        (SURE_PATHS, 1, 0.02, True, "In this map", FLOOR, f"{SURE}. {FINER}"),
+        (CIRCLES, None, 0.62, False, "Not in this map", None, NO_PHOTO),
+        (CIRCLES, None, 0.2, False, "Probably not in this map", None, ELSEWHERE),
     ],
     ids=[
         "circle",
@@ -203,8 +153,7 @@ def test_the_card_answers_at_the_finest_certain_level_and_says_how_sure_it_is(
         "radius_68_m": 42.4 if levels is CIRCLES else None,
         "radius_95_m": None,
     }
-    visitor.page.route("**/api/v1/similarity?*", lambda route: route.fulfill(json=found))
-    page = ask(visitor, town.queries[0])
+    page = ask(visitor, town.queries[0], found)
     expect(page.locator(".badge")).to_have_text(title)
     expect(page.locator(".verdict .place")).to_have_text([place] if place else [])
     expect(page.locator(".reason")).to_have_text(reason)
@@ -278,8 +227,7 @@ def test_photos_without_a_place_keep_their_rank_and_are_counted(
     first |= {"latitude": None, "longitude": None, "place": None, "match_probability": None}
     first["original_filename"] = "without.jpg"
     found |= {"matches_without_place": 1}
-    visitor.page.route("**/api/v1/similarity?*", lambda route: route.fulfill(json=found))
-    page = ask(visitor, town.queries[0])
+    page = ask(visitor, town.queries[0], found)
     expect(page.locator(".verdict")).to_contain_text(
         "1 of these 12 photos has neither coordinates nor a label."
     )
@@ -293,8 +241,7 @@ def test_an_empty_map_finds_nothing_and_recommends_no_vocabulary(
     found = town.ask(town.queries[0]) | {"similar_images": [], "vocabulary": "foreign"}
     found["estimate"] |= {"levels": [], "in_map": None, "latitude": None, "place": None}
     found["estimate"] |= {"answer_level": None, "not_in_map_probability": None}
-    visitor.page.route("**/api/v1/similarity?*", lambda route: route.fulfill(json=found))
-    page = ask(visitor, town.queries[0])
+    page = ask(visitor, town.queries[0], found)
     expect(page.get_by_role("heading", name="No photo found")).to_be_visible()
     expect(page.locator(".verdict .hint")).to_have_count(0)
 
@@ -311,8 +258,7 @@ def test_an_answer_without_a_place_is_no_guess(visitor: Visitor, town: Town) -> 
     for photo in found["similar_images"]:
         photo |= {"latitude": None, "place": None, "match_probability": None}
     found["matches_without_place"] = len(found["similar_images"])
-    visitor.page.route("**/api/v1/similarity?*", lambda route: route.fulfill(json=found))
-    page = ask(visitor, town.queries[0])
+    page = ask(visitor, town.queries[0], found)
     expect(page.locator(".badge")).to_have_text("No estimate")
     expect(page.locator(".reason")).to_have_text("None has a place.")
     page.locator(".figures summary").click()
@@ -326,9 +272,8 @@ def test_long_names_of_matches_stay_on_a_narrow_phone(visitor: Visitor, town: To
     for photo in found["similar_images"]:
         name = {"original_filename": "a_name_without_a_space_" * 4 + ".jpg", "relative_path": None}
         photo |= {**name, "latitude": None, "place": "building/floor_7/" * 4}
-    visitor.page.route("**/api/v1/similarity?*", lambda route: route.fulfill(json=found))
     visitor.page.set_viewport_size({"width": 320, "height": 640})
-    page = ask(visitor, town.queries[0])
+    page = ask(visitor, town.queries[0], found)
     page.locator(".figures summary").click()
     assert page.evaluate("document.documentElement.scrollWidth") <= 320
 

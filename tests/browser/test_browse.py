@@ -93,18 +93,15 @@ def test_chosen_photos_are_tagged_and_deleted(visitor: Visitor, town: Town) -> N
     assert town.get("/search", filename="tagged-")["total_found"] == 1
 
 
-def test_coordinates_are_shown_without_rounding_errors(visitor: Visitor, town: Town) -> None:
-    (photo_id,) = bring_in(town, "rounded.jpg")
+def test_a_photo_is_moved_and_named_and_shows_no_rounding_errors(
+    visitor: Visitor, town: Town
+) -> None:
+    (photo_id,) = bring_in(town, "moved.jpg")
     town.server.client.patch(
         f"/api/v1/uploads/{photo_id}", params={"map": MAP}, json={"longitude": 8.700000000000001}
     ).raise_for_status()
     page = visitor.visit(f"photo/{photo_id}")
     expect(page.get_by_label("Longitude")).to_have_value("8.7")
-
-
-def test_a_photo_is_moved_and_named(visitor: Visitor, town: Town) -> None:
-    (photo_id,) = bring_in(town, "moved.jpg")
-    page = visitor.visit(f"photo/{photo_id}")
     page.on("dialog", Dialog.dismiss)
     page.get_by_label("Latitude").fill("44.5")
     page.get_by_label("Place").fill("Harbour <b>wall</b>")

@@ -10,19 +10,8 @@ from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import Town, Visitor
 
-VIEWS = [
-    "ask",
-    "answer",
-    "compare",
-    "photos",
-    "photo",
-    "tracks",
-    "track",
-    "add",
-    "locate",
-    "model",
-    "status",
-]
+VIEWS = ["ask", "answer", "compare", "photos", "photo", "tracks", "track"]
+VIEWS += ["add", "locate", "model", "status"]
 SERIOUS = {"serious", "critical"}
 
 
