@@ -130,14 +130,6 @@ def _wait_for_collection(running: ServerProcess) -> None:
     _wait_for(lambda: _figures(running).get("placewise_steward_tasks_total", {}).get(done, 0) >= 1)
 
 
-def test_removed_catalog_stops_every_start_and_no_object_is_touched(filled: Filled) -> None:
-    before = {info.key for info in filled.store.list("")}
-    filled.remove_catalog()
-    filled.check_refused("serve")
-    assert not (filled.home / "catalog.sqlite").exists(), "a restored file would meet it"
-    assert {info.key for info in filled.store.list("")} == before
-
-
 def test_wrong_catalog_stops_every_start_and_no_object_is_touched(
     filled: Filled, migrated_sqlite: Path, tmp_path: Path
 ) -> None:
@@ -177,11 +169,17 @@ def test_older_catalog_that_is_made_the_owner_deletes_no_original(filled: Filled
     assert filled.originals() == originals
 
 
-def test_adopted_store_keeps_what_its_new_catalog_does_not_know(filled: Filled) -> None:
+def test_a_removed_catalog_stops_every_start_until_the_store_is_adopted_which_deletes_nothing(
+    filled: Filled,
+) -> None:
     originals, before = filled.originals(), filled.stored_photos()
+    objects = {info.key for info in filled.store.list("")}
     owner = filled.store.read_note(".placewise")
     assert owner is not None
     filled.remove_catalog()
+    filled.check_refused("serve")
+    assert not (filled.home / "catalog.sqlite").exists(), "a restored file would meet it"
+    assert {info.key for info in filled.store.list("")} == objects
     shown = filled.command("storage", "adopt", "--json")
     assert shown.returncode == 0, shown.stderr
     body = json.loads(shown.stdout)
