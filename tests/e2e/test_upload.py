@@ -113,7 +113,8 @@ def test_the_same_bytes_again_are_the_same_photo_and_elsewhere_they_are_refused(
 ) -> None:
     first = server.indexed(photo_bytes(4), "one.jpg", latitude=45.0, longitude=7.0, place="yard")
     before = stored(server)
-    for fields in ({}, {"latitude": 45.0, "longitude": 7.0, "place": "yard"}):
+    same: list[dict[str, Any]] = [{}, {"latitude": 45.0, "longitude": 7.0, "place": "yard"}]
+    for fields in same:
         answer = server.upload(photo_bytes(4), "another-name.jpg", **fields)
         assert answer.status_code == 200
         assert answer.json()["file_id"] == first
