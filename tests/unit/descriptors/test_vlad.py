@@ -127,17 +127,15 @@ def test_anylocs_vocabularies_give_rows_of_the_published_dimension(
     np.testing.assert_allclose(row, unit(unit(expected).reshape(-1)), atol=1e-5)
 
 
-def test_first_of_equally_similar_centres_gets_the_patch() -> None:
-    centres = tensor(np.array([[0.0, 1.0], [1.0, 0.0], [2.0, 0.0]]))
-    assert assign_clusters(tensor(np.array([[1.0, 0.0]])), centres).tolist() == [1]
-
-
-def test_unused_clusters_stay_exactly_zero() -> None:
+def test_first_of_equally_similar_centres_gets_the_patch_and_others_stay_exactly_zero() -> None:
     centres = np.eye(4)
     patches = unit(np.array([[[1.0, 0.1, 0.0, 0.0], [0.1, 0.0, 1.0, 0.0]]]))
     blocks = vlad(tensor(patches), tensor(centres)).reshape(4, 4)
     used = [bool((block != 0).any()) for block in blocks]
     assert used == [True, False, True, False]
+    assert not vlad(tensor(centres[None]), tensor(centres)).any(), "patches equal their centres"
+    alike = tensor(np.array([[0.0, 1.0], [1.0, 0.0], [2.0, 0.0]]))
+    assert assign_clusters(tensor(np.array([[1.0, 0.0]])), alike).tolist() == [1]
 
 
 Aggregate = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
@@ -147,39 +145,27 @@ BOTH = pytest.mark.parametrize(
 
 
 @BOTH
-def test_zero_patches_stay_out_of_the_sums(aggregate: Aggregate) -> None:
+def test_zero_patches_stay_out_of_the_sums_and_a_photo_of_nothing_else_is_similar_to_nothing(
+    aggregate: Aggregate,
+) -> None:
     features, centres = some_patches(5, 2, 7, 8), tensor(raw_centres(6, 4, 8))
+    rows = aggregate(tensor(features), centres)
     blank = np.concatenate([np.zeros((2, 3, 8)), features, np.zeros((2, 1, 8))], axis=1)
-    np.testing.assert_allclose(
-        aggregate(tensor(blank), centres), aggregate(tensor(features), centres), atol=1e-6
-    )
-
-
-@BOTH
-def test_photo_of_nothing_but_zero_patches_is_similar_to_nothing(aggregate: Aggregate) -> None:
-    features = np.zeros((2, 7, 8))
-    features[1] = some_patches(5, 1, 7, 8)[0]
-    rows = aggregate(tensor(features), tensor(raw_centres(6, 4, 8)))
+    np.testing.assert_allclose(aggregate(tensor(blank), centres), rows, atol=1e-6)
+    blank[0] = 0
+    rows = aggregate(tensor(blank), centres)
     assert rows[0].tolist() == [0.0] * 32
     assert float(torch.linalg.norm(rows[1])) == pytest.approx(1.0, abs=1e-6)
 
 
 @BOTH
-@pytest.mark.parametrize("broken", [math.nan, math.inf, -math.inf])
-def test_photo_with_a_number_that_is_not_finite_has_a_row_of_nan(
-    aggregate: Aggregate, broken: float
-) -> None:
-    features = tensor(some_patches(5, 3, 7, 8))
-    features[1, 2, 3] = broken
-    rows = aggregate(features, tensor(raw_centres(6, 4, 8)))
-    assert bool(torch.isnan(rows[1]).all())
-    assert bool(torch.isfinite(rows[[0, 2]]).all())
-
-
-def test_patches_that_equal_their_centre_leave_a_zero_row() -> None:
-    centres = np.eye(3)
-    rows = vlad(tensor(centres[None]), tensor(centres))
-    assert rows.tolist() == [[0.0] * 9]
+def test_photo_with_a_number_that_is_not_finite_has_a_row_of_nan(aggregate: Aggregate) -> None:
+    for broken in (math.nan, math.inf, -math.inf):
+        features = tensor(some_patches(5, 3, 7, 8))
+        features[1, 2, 3] = broken
+        rows = aggregate(features, tensor(raw_centres(6, 4, 8)))
+        assert bool(torch.isnan(rows[1]).all())
+        assert bool(torch.isfinite(rows[[0, 2]]).all())
 
 
 @BOTH
