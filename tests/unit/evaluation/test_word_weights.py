@@ -68,7 +68,7 @@ def test_weights_are_the_gap_of_the_means_over_the_deviation_of_far_pairs() -> N
     assert weights == pytest.approx([expected, 0.0, 0.0])
 
 
-def test_what_two_halves_teach_adds_up() -> None:
+def test_what_two_halves_teach_adds_up_and_without_pairs_nothing_can_be_learnt() -> None:
     rng = np.random.default_rng(3)
     near, far = rng.random((10, WORDS)), rng.random((12, WORDS))
     whole = PairStatistics(ProductMoments.from_products(near), ProductMoments.from_products(far))
@@ -78,14 +78,11 @@ def test_what_two_halves_teach_adds_up() -> None:
             ProductMoments.from_products(near[part]), ProductMoments.from_products(far[part])
         )
     assert parts.weights() == pytest.approx(whole.weights())
-
-
-def test_without_pairs_nothing_can_be_learnt() -> None:
     with pytest.raises(ValueError, match="0 near and 0 far"):
         empty_pair_statistics(WORDS).weights()
 
 
-def test_weighted_query_is_its_words_multiplied_and_of_length_one() -> None:
+def test_weighted_query_is_its_words_multiplied_and_of_length_one_unless_nothing_is_left() -> None:
     query = unit_rows(2, 1)[0]
     weighted = apply_word_weights(query, [2.0, 0.0, 1.0, 0.5])
     assert weighted is not None
@@ -94,12 +91,9 @@ def test_weighted_query_is_its_words_multiplied_and_of_length_one() -> None:
     assert apply_word_weights(query, [1.0] * WORDS) == pytest.approx(
         query.astype(np.float64), abs=1e-6
     )
-
-
-def test_a_query_without_weighted_words_stays_plain_and_wrong_weights_are_refused() -> None:
-    assert apply_word_weights(unit_rows(2, 1)[0], [0.0] * WORDS) is None
+    assert apply_word_weights(query, [0.0] * WORDS) is None
     with pytest.raises(ValueError, match="5 weights don't fit 12"):
-        apply_word_weights(unit_rows(2, 1)[0], [1.0] * 5)
+        apply_word_weights(query, [1.0] * 5)
 
 
 # --- which pairs -----------------------------------------------------------------------------
