@@ -250,17 +250,13 @@ def png_without_pixels(width: int, height: int, *between: bytes) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", size) + b"".join(between)
 
 
-def test_exif_of_a_png_is_read_where_it_precedes_the_pixels() -> None:
+def test_exif_of_a_png_is_read_before_the_pixels_and_not_waited_for_behind_them() -> None:
     exif = whole_exif().removeprefix(b"Exif\0\0")
     data = png_without_pixels(30, 20, chunk(b"eXIf", exif), chunk(b"IDAT", b"no pixels at all"))
     found = header(data)
     assert (found.width, found.height) == (20, 30)
     assert found.latitude == pytest.approx(45.07)
     assert found.captured_at == datetime(2024, 5, 6, 10, 20, 30, 500_000, tzinfo=UTC)
-
-
-def test_exif_behind_the_pixels_is_not_waited_for() -> None:
-    exif = whole_exif().removeprefix(b"Exif\0\0")
     data = png_without_pixels(30, 20, chunk(b"IDAT", b"no pixels"), chunk(b"eXIf", exif))
     assert header(data) == PhotoHeader(width=30, height=20)
 
