@@ -13,29 +13,6 @@ from shared.errors import Misconfigured
 from shared.storage.s3 import Bucket
 
 
-def test_environment_decides_and_the_rest_has_defaults(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("MAX_FILE_SIZE", "123")
-    monkeypatch.setenv("LEASE_SECONDS", "0.5")
-    settings = Settings()
-    assert settings.max_file_size == 123
-    assert settings.lease_seconds == 0.5
-    assert settings.placewise_home == tmp_path / "home"
-    assert settings.max_image_pixels == 200_000_000
-    monkeypatch.delenv("MAX_FILE_SIZE")
-    assert Settings().max_file_size == 100_000_000
-
-
-def test_outside_of_tests_the_real_extractor_is_the_default(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.delenv("EXTRACTOR")
-    monkeypatch.delenv("ALLOW_TEST_EXTRACTORS")
-    assert Settings().extractor == "efficientnet-lite0-vlad128"
-    assert Settings().allow_test_extractors is False
-
-
 def test_env_file_is_read_and_the_environment_goes_before_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -326,7 +303,6 @@ def test_the_extractor_of_new_maps_is_allowed_by_being_chosen(
     ("variable", "value", "message"),
     [
         ("TORCHHUB_ALLOWED", UNPINNED, "git ls-remote"),
-        ("TORCHHUB_ALLOWED", f"{HUB},anyloc-vitb14", "after the repository comes the entry"),
         (
             "TORCHHUB_ALLOWED",
             f"{HUB} anyloc-vitb14",
