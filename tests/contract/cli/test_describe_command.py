@@ -203,7 +203,6 @@ def test_interrupted_run_leaves_nothing_behind(
         (["--extractor", "anyloc-vits14", "--backbone", "dinov2_vits14"], "options_contradict", ""),
         (["--backbone", "dinov3"], "unknown_backbone", "dinov2_vits14"),
         (["--layer", "3"], "bad_extractor_option", "'layer'"),
-        (["--backbone", "dinov2_vits14", "--layer", "12"], "bad_extractor_option", "0 to 11"),
         (["--weights", "{centres}"], "weights_unused", "test-tiny-avg"),
         (["--backbone", "dinov2_vits14"], "vocabulary_missing", "--vocabulary FILE"),
         (["--extractor", "test-tiny-avg", "--vocabulary", "{centres}"],
