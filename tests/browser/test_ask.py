@@ -345,7 +345,7 @@ def test_of_two_questions_the_later_one_is_answered(visitor: Visitor, town: Town
     expect(page.locator(".query-photo figcaption")).to_have_text("later.jpg")
 
 
-def test_what_is_no_photo_gets_the_reason(visitor: Visitor) -> None:
+def test_a_file_that_is_no_photo_is_rejected_with_the_reason(visitor: Visitor) -> None:
     page = visitor.visit("ask")
     page.locator("input[data-use=ask]").set_input_files(
         {"name": "notes.txt", "mimeType": "text/plain", "buffer": b"no photo" * 20}

@@ -97,7 +97,7 @@ def test_views_are_named_and_marked_as_the_current_one(visitor: Visitor) -> None
     expect(page.locator(".tabs [aria-current=page]")).to_have_text("Advanced")
 
 
-def test_a_server_that_goes_away_is_named_and_found_again(visitor: Visitor) -> None:
+def test_an_unreachable_server_is_reported_and_found_again(visitor: Visitor) -> None:
     page = visitor.visit("status")
     expect(page.locator(".card .chip.healthy")).to_be_visible()
     page.route("**/api/**", lambda route: route.abort())

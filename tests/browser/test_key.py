@@ -61,7 +61,9 @@ def test_the_key_is_remembered_on_this_device_until_it_is_forgotten(page: Page) 
     assert KEY not in another_tab.evaluate("JSON.stringify([localStorage, sessionStorage])")
 
 
-def test_a_key_that_only_reads_is_told_what_it_lacks(page: Page, locked: ServerProcess) -> None:
+def test_a_read_only_key_gets_a_message_that_names_the_missing_scope(
+    page: Page, locked: ServerProcess
+) -> None:
     made = locked.client.post("/api/v1/keys", json={"name": "reader", "scopes": ["read"]})
     assert made.status_code == 201, made.text
     give(page, made.json()["key"])

@@ -101,7 +101,7 @@ def test_a_comparison_stays_on_a_narrow_phone(visitor: Visitor) -> None:
     assert page.evaluate("document.documentElement.scrollWidth") <= 320
 
 
-def test_labels_are_told_to_be_names_and_automatic_again(visitor: Visitor, town: Town) -> None:
+def test_labels_can_be_set_to_names_and_back_to_automatic(visitor: Visitor, town: Town) -> None:
     page = visitor.visit("model")
     labels = page.get_by_label("Labels")
     expect(labels).to_have_value("auto")

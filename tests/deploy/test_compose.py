@@ -70,9 +70,7 @@ def test_file_follows_the_compose_specification(file: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_each_choice_of_profiles_is_read_and_has_what_it_says(
-    project: Path, values: dict[str, str]
-) -> None:
+def test_each_profile_starts_its_services(project: Path, values: dict[str, str]) -> None:
     always = {"gateway", "search-0", "search-1", "steward", "postgres", "redis"}
     always |= {"migrate", "create-bucket"}
     more = {
@@ -186,7 +184,7 @@ def test_every_service_runs_without_rights_that_it_does_not_need(
             assert not service.get("cap_add"), name
 
 
-def test_every_service_has_a_health_check_or_is_done_once(
+def test_every_service_has_a_health_check_or_runs_once(
     all_services: dict[str, Json],
 ) -> None:
     for name, service in all_services.items():
@@ -217,7 +215,7 @@ def test_each_image_is_built_for_the_command_that_it_runs(all_services: dict[str
     assert all_services["extractor"]["image"] != all_services["extractor-gpu"]["image"]
 
 
-def test_whoever_asks_search_knows_every_shard(everything: dict[str, Json]) -> None:
+def test_search_urls_name_every_shard(everything: dict[str, Json]) -> None:
     workers = {name: s for name, s in everything.items() if name.startswith("search-")}
     urls = {f"http://{name}:{s['environment']['PORT']}" for name, s in workers.items()}
     for name in ("gateway", "steward"):
@@ -250,7 +248,7 @@ def test_only_the_gateway_flower_and_grafana_listen_to_the_machine_and_only_on_l
         assert {port["host_ip"] for port in ports} == {"127.0.0.1"}
 
 
-def test_the_servers_are_on_a_network_that_leads_nowhere(everything: dict[str, Json]) -> None:
+def test_the_servers_are_on_an_internal_network(everything: dict[str, Json]) -> None:
     assert yaml.safe_load(SERVICES.read_text())["networks"]["inside"]["internal"]
     servers = {"postgres", "redis", "objects", "prometheus"}
     assert {n for n, s in everything.items() if set(s.get("networks", {})) == {"inside"}} >= servers
@@ -268,7 +266,7 @@ def test_an_extractor_has_time_to_end_its_drain(everything: dict[str, Json]) -> 
         assert seconds(everything[name]["stop_grace_period"]) > 2 * SHUTDOWN_GRACE_SECONDS
 
 
-def test_redis_forgets_nothing_by_itself(everything: dict[str, Json]) -> None:
+def test_redis_persists_and_evicts_nothing(everything: dict[str, Json]) -> None:
     command = " ".join(everything["redis"]["command"])
     assert "--appendonly yes" in command
     assert "--maxmemory-policy noeviction" in command

@@ -45,6 +45,6 @@ def test_an_extractor_beats_in_its_drains(
     assert seconds_since_heartbeat(tmp_path / "heartbeat") < 60
 
 
-def test_no_file_is_no_beat(tmp_path: Path) -> None:
+def test_without_a_heartbeat_file_nothing_is_written(tmp_path: Path) -> None:
     Heartbeat(None).beat()
     assert list(tmp_path.iterdir()) == []

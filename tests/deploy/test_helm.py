@@ -241,7 +241,7 @@ def test_an_external_store_fills_the_secret_that_the_pods_read() -> None:
 
 
 @EACH
-def test_whoever_calls_search_knows_every_worker_that_may_be_there(name: str) -> None:
+def test_search_urls_name_every_worker_that_autoscaling_may_start(name: str) -> None:
     workers = of_kind(name, "StatefulSet")
     scaled = by_component(name, "HorizontalPodAutoscaler")
     urls = {
@@ -263,7 +263,7 @@ def test_whoever_calls_search_knows_every_worker_that_may_be_there(name: str) ->
 
 
 @EACH
-def test_what_selects_pods_selects_those_that_it_means(name: str) -> None:
+def test_label_selectors_match_the_intended_pods(name: str) -> None:
     pods = {
         part: pod(workload)["metadata"]["labels"]
         for part, workload in by_component(name, *WORKLOADS).items()
@@ -383,7 +383,7 @@ def test_backups_go_to_a_volume_that_outlives_the_release() -> None:
     assert volume_claim["metadata"]["annotations"]["helm.sh/resource-policy"] == "keep"
 
 
-def test_a_restore_is_the_backups_job_with_another_word_and_needs_no_service() -> None:
+def test_a_restore_runs_the_backup_job_with_another_command_and_no_service() -> None:
     """As docs/how-to/kubernetes.md has it: two templates, and the second argument."""
     files = helm_of_example("production")["files"]
     texts = [files[f"placewise/templates/{name}.yaml"] for name in ("settings", "backup")]

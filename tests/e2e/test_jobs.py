@@ -197,7 +197,7 @@ def test_a_cancelled_job_stays_undone_until_it_is_retried(server: ServerProcess)
     assert server.similar(uploaded["file_id"]).status_code == 200
 
 
-def test_a_running_job_is_cancelled_and_its_work_thrown_away(server: ServerProcess) -> None:
+def test_a_running_job_is_cancelled_and_its_result_discarded(server: ServerProcess) -> None:
     with server.no_decoding():
         uploaded = server.upload(photo_bytes(next(fresh))).json()
         while get(server, uploaded["status_url"])["state"] != "running":

@@ -163,7 +163,9 @@ def test_a_photo_that_could_not_be_described_says_why(server: ServerProcess) -> 
     assert failed["error"]["detail"] in body["detail"]
 
 
-def test_a_query_is_a_job_when_nobody_waits(server: ServerProcess, places: list[str]) -> None:
+def test_a_query_without_prefer_wait_is_answered_with_a_job(
+    server: ServerProcess, places: list[str]
+) -> None:
     files = {"file": ("q.jpg", re_encoded(1))}
     with server.no_decoding():
         answer = server.client.post(SIMILARITY, files=files, params={"top_k": 2, "min_score": 0.5})

@@ -22,7 +22,7 @@ FAULTS = {
 
 
 @pytest.mark.timeout(900)
-def test_whatever_dies_no_photo_is_lost_doubled_or_stuck_and_no_answer_is_wrong() -> None:
+def test_killed_services_lose_and_duplicate_no_photo_and_give_no_wrong_answer() -> None:
     faults = [fault for fault in all_faults() if fault.name in FAULTS]
     assert len(faults) == len(FAULTS)
     run = run_chaos(

@@ -24,7 +24,7 @@ print(json.dumps(sorted(Base.metadata.tables)))
 """
 
 
-def test_whoever_opens_the_catalog_knows_every_table() -> None:
+def test_opening_the_catalog_registers_every_table() -> None:
     # In a process of its own: here the tests have imported them all.
     opened = subprocess.run(
         [sys.executable, "-c", OPEN], cwd=ROOT, check=True, capture_output=True, text=True

@@ -161,7 +161,7 @@ def test_holding_a_lost_lease_does_not_bring_it_back(catalog: Catalog, map_id: U
     assert (found.state, found.lease_token) == (JobState.QUEUED, None)
 
 
-def test_a_lease_is_held_on_although_the_catalog_was_away(
+def test_a_lease_survives_an_outage_of_the_catalog(
     catalog: Catalog, map_id: UUID, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     queue(catalog, map_id)

@@ -142,7 +142,7 @@ def api(machine: Machine, values: dict[str, str]) -> Iterator[Caller]:
         yield made
 
 
-def test_api_servers_and_flower_want_their_passwords(machine: Machine) -> None:
+def test_api_servers_and_flower_require_their_passwords(machine: Machine) -> None:
     assert machine.run_once("create-bucket", S3_SECRET_KEY="another") == 1
     redis = f"redis://127.0.0.1:{machine.port('redis')}"
     with Redis.from_url(redis) as stranger, pytest.raises(RedisError):

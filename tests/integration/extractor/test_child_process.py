@@ -74,7 +74,7 @@ def test_a_process_that_dies_is_an_error_that_says_how() -> None:
         run_in_child(kill_itself, on_progress=nothing, check=nothing)
 
 
-def test_work_that_is_not_wanted_any_more_ends_at_once() -> None:
+def test_cancelled_work_ends_at_once() -> None:
     pids: list[int] = []
 
     def check() -> None:

@@ -138,7 +138,7 @@ def test_filters_and_least_score_hold_for_what_is_compared(service: Service) -> 
 # --- parameters ------------------------------------------------------------------------------
 
 
-def test_new_photo_is_described_then_compared_once_whoever_fetches_it(service: Service) -> None:
+def test_a_new_photo_is_described_and_compared_once_for_all_requests(service: Service) -> None:
     service.indexed(*range(5))
     described = service.ask(near_copy(1), **CLOSELY)
     service.drain()

@@ -130,7 +130,7 @@ def _age(store: FolderStore, key: str, seconds: float) -> None:
     os.utime(store.path(key), (then, then))
 
 
-def test_no_lease_is_held_on_when_the_catalog_went_away_in_a_drain(
+def test_leases_end_when_the_catalog_becomes_unreachable_during_a_drain(
     averages: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photo_ids = averages.upload(*range(8))
@@ -237,7 +237,7 @@ def test_a_photo_deleted_before_it_is_read_costs_nothing(averages: Workplace) ->
 
 
 @pytest.mark.parametrize("failing", ["open", "writer"])
-def test_jobs_pause_while_the_object_store_is_away_and_no_attempt_is_counted(
+def test_jobs_pause_while_the_object_store_is_unreachable_and_no_attempt_is_counted(
     averages: Workplace, monkeypatch: pytest.MonkeyPatch, failing: str
 ) -> None:
     photo_ids = averages.upload(1, 2)

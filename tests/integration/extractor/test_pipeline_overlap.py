@@ -183,7 +183,7 @@ def test_batch_whose_publishing_crashes_is_tried_alone_and_the_next_one_is_not_t
     assert {job.attempts for job in jobs} == {0}
 
 
-def test_object_store_that_goes_away_while_publishing_costs_no_attempt(
+def test_an_object_store_outage_during_publishing_costs_no_attempt(
     averages: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real, calls = FolderStore.writer, iter(range(100))

@@ -166,7 +166,7 @@ def test_where_every_connection_is_at_work_a_further_one_is_refused(
             assert b"200 OK" in answer_of(client), "nobody's call was cut short"
 
 
-def test_a_trusted_proxy_has_any_number_of_connections_and_says_who_calls() -> None:
+def test_a_trusted_proxy_has_unlimited_connections_and_names_the_client_address() -> None:
     forwarded = ASK.replace(b"\r\n\r\n", b"\r\nX-Forwarded-For: 192.0.2.7\r\n\r\n")
     with serving(per_address=2, trusted_proxies=(ip_network("127.0.0.2/32"),)) as server:
         with contextlib.ExitStack() as held:
@@ -248,7 +248,7 @@ def test_a_client_that_disconnects_counts_as_499_without_a_traceback(
     assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
 
 
-def test_an_answer_that_nobody_reads_ends_the_connection() -> None:
+def test_a_response_that_the_client_does_not_read_ends_the_connection() -> None:
     with serving(stalled_seconds=1.0) as server:
         with server.connect() as reading, server.connect() as stalled:
             for client in (reading, stalled):

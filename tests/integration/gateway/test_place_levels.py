@@ -100,7 +100,7 @@ def test_a_level_filters_photos_below_it_and_an_exact_label_only_its_own(tower: 
         problem(answer, 422, "invalid_field")
 
 
-def test_labels_become_paths_and_names_again_as_the_map_is_told(service: Service) -> None:
+def test_the_map_setting_turns_labels_into_paths_and_back(service: Service) -> None:
     for number, place in enumerate(PATHS):
         service.upload(photo_bytes(number), place=place)
     service.drain()

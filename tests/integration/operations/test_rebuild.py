@@ -386,7 +386,7 @@ def test_a_home_of_before_the_journal_comes_back_with_what_exif_says(
     assert len(answers(service, first)) == 1
 
 
-def test_a_photo_whose_original_is_gone_stays_away(
+def test_a_photo_whose_original_is_missing_is_not_restored(
     service: Service, store: FolderStore, settings: Settings
 ) -> None:
     first, _ = service.indexed(1, 2)

@@ -84,7 +84,7 @@ def test_the_tables_of_another_version_are_refused_at_once_and_stay_as_they_are(
         ("/none?host=/nowhere", "database none at /nowhere"),
     ],
 )
-def test_catalog_that_is_away_is_waited_for(address: str, named: str) -> None:
+def test_an_unreachable_catalog_is_waited_for(address: str, named: str) -> None:
     nowhere = Catalog(f"postgresql+psycopg://{address}", PoolConfig(connect_seconds=2))
     with pytest.raises(Unavailable) as caught:
         wait_for_schema(nowhere, 0.1)

@@ -127,7 +127,7 @@ def test_an_item_that_kills_its_stewards_is_given_up_and_the_others_come_in(
     assert codes(batches.items(job_id)) == [None, None, "worker_crashed", None]
 
 
-def test_a_batch_pauses_while_the_store_is_away(
+def test_a_batch_pauses_while_the_object_store_is_unreachable(
     batches: Batches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job_id = batches.start_import(files(1, 2))

@@ -88,7 +88,7 @@ def test_any_of_the_keys_beside_the_catalog_opens_everything(none_stored: Catalo
         check(ApiKeyAuthenticator(none_stored), authorization=f"Bearer {KEY}")
 
 
-def test_while_the_catalog_is_away_only_the_keys_beside_it_open() -> None:
+def test_while_the_catalog_is_unreachable_only_the_configured_keys_are_accepted() -> None:
     away = Catalog("postgresql+psycopg://nobody@127.0.0.1:9/none")
     keys = ApiKeyAuthenticator(away, hash_api_key(KEY))
     check(keys, authorization=f"Bearer {KEY}")
@@ -126,7 +126,7 @@ def test_an_admin_may_everything_and_no_other_scope_implies_one() -> None:
 
 
 @pytest.mark.parametrize("host", ["LOCALHOST:80", "localhost.", "127.0.0.1:8000", "[::1]:8000"])
-def test_without_keys_whoever_calls_this_machine_may(host: str) -> None:
+def test_without_keys_calls_on_loopback_are_allowed(host: str) -> None:
     check(LocalhostAuthenticator(), host=host)
     check(LocalhostAuthenticator(), host=host, authorization="Bearer whatever")
     check(LocalhostAuthenticator(), host=host, origin=f"http://{host}")

@@ -233,7 +233,7 @@ def test_body_that_ends_early_is_refused_and_leaves_nothing(
     assert error.code == "malformed_body"
 
 
-def test_client_that_goes_away_leaves_nothing(store: FolderStore) -> None:
+def test_a_client_that_disconnects_leaves_no_object(store: FolderStore) -> None:
     whole = file(bytes(5000)) + END
     body = Body(in_pieces(whole[:4000], 500), cut_off=True)
     with pytest.raises(ClientDisconnect):

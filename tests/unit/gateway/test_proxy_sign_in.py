@@ -69,7 +69,7 @@ def test_a_user_of_the_proxy_has_the_scopes_of_the_groups(
     assert call(sign_in, peer, USER, ("X-Forwarded-Groups", "chiefs")).scopes == ALL_SCOPES
 
 
-def test_a_user_without_the_scope_is_told_where_scopes_of_users_are_set(
+def test_a_user_without_the_scope_gets_the_setting_that_grants_it(
     sign_in: Authenticator,
 ) -> None:
     app = FastAPI()
@@ -118,7 +118,7 @@ def test_pages_of_other_origins_can_not_use_the_cookie_of_the_proxy(
     assert call(sign_in, PROXY, USER, ("Origin", "https://places.example")).identity == "user ada"
 
 
-def test_without_the_setting_nobody_is_signed_in(keys: Authenticator) -> None:
+def test_without_the_setting_no_user_is_signed_in(keys: Authenticator) -> None:
     assert with_proxy_sign_in(keys, Settings()) is keys
     assert code(keys, PROXY, USER) == "key_missing"
 

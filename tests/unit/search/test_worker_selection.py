@@ -135,7 +135,7 @@ def test_a_new_number_of_shards_is_used_once_all_of_them_have_the_generation(
         httpx2.DecodingError("cut off"),
     ],
 )
-def test_whoever_does_not_answer_as_a_search_worker_does_is_away(
+def test_a_server_that_does_not_answer_as_a_search_worker_is_unreachable(
     fake: FakeWorkers, answer: httpx2.Response | Exception
 ) -> None:
     fake.answers = {"http://a": answer}

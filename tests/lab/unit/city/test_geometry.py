@@ -146,7 +146,9 @@ def test_neighbouring_places_share_houses(plan: CityPlan, scene: Scene) -> None:
     assert all(houses[a] != houses[b] for a, b in neighbours)
 
 
-def test_who_looks_the_other_way_sees_none_of_the_houses(plan: CityPlan, scene: Scene) -> None:
+def test_a_camera_that_looks_the_other_way_sees_none_of_the_houses(
+    plan: CityPlan, scene: Scene
+) -> None:
     seen = {
         shot.place: houses_seen(scene, shot.camera, 25.0)
         for shot in of_role(plan, "database")
