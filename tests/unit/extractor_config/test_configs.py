@@ -18,6 +18,7 @@ from shared.extractor_config.configs import (
     pooled_config,
 )
 from shared.imaging.preprocessing import PREPROCESSINGS as IN_VISION
+from shared.imaging.preprocessing import get_preprocessing
 
 ANYLOC_OPTIONS = "Its options: aggregator, clusters, facet, layer, preprocessing."
 
@@ -200,8 +201,9 @@ def test_names_take_further_options() -> None:
 def test_preprocessings_are_those_that_vision_has() -> None:
     assert set(IN_VISION) == {*PREPROCESSING_NAMES, "square32"}
     for found in EXTRACTOR_CONFIGS.values():
-        assert found.preprocessing in IN_VISION
-        assert found.aggregator in EXTRACTOR_AGGREGATORS
+        assert found.preprocessing is not None
+        assert get_preprocessing(found.preprocessing).name == found.preprocessing
+        assert found.aggregator in (*EXTRACTOR_AGGREGATORS, "none")
 
 
 def test_only_what_changes_the_local_features_needs_another_backbone() -> None:
