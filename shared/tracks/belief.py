@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 MAX_BYTES = 1_000_000
 START_GAIN = 0.5
 """`gain` before the first frame, cautious"""
@@ -42,6 +42,8 @@ class Belief:
     """mean log-likelihood of the frames at the predicted places, relative to that of any place"""
     gain_weight: float = START_GAIN_WEIGHT
     """number of independent, tracked frames that `gain` is the mean of"""
+    pace: float = 1.0
+    """seconds along the map's sequences for each second of the track, negative backwards"""
     status: TrackStatus = "converging"
     frames: int = 0
     """number of frames so far"""

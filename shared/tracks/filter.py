@@ -60,6 +60,7 @@ from shared.tracks.photo_graph import (
     PhotoGraph,
     PhotoTable,
     distance_matrix_m,
+    signed_gap_seconds,
     unit_vectors,
 )
 from shared.tracks.state import TrackState, next_status, track_state
@@ -78,6 +79,13 @@ MAX_GAIN_WEIGHT = 200.0
 """Number of frames that the gain is the mean of, at most: it follows the light and the weather"""
 NEWS_WEIGHT = 1.5
 """A frame with two thirds of new evidence counts in full"""
+STRETCH_SECONDS = 5.0
+"""of a map's sequence before and after a photo. How they share the evidence of a stretch counts in
+full even where the camera sees nothing new, so that a camera that stands is not moved on"""
+PACE_SPREAD = 1.0
+"""Standard deviation of a camera's pace around the learned one, in paces of the map"""
+PACE_FRAMES = 30.0
+"""Number of tracked frames that the pace is the mean of"""
 SPACING_M = 10.0
 """Standard deviation between a frame and the photo of the map that shows it"""
 MAX_REACH_M = 1000.0
@@ -214,7 +222,7 @@ class TrackFilter:
         if evidence.fix is not None:
             near_fix, fix_complete_m = _near_fix(self._graph, evidence.fix)
             targets = targets.union(near_fix)
-        kernel = self._kernel(sources, targets, complete_m, seconds, evidence)
+        kernel = self._kernel(sources, targets, complete_m, seconds, evidence, before.pace)
         seen = _excess(evidence, count)
         weight = min(1.0, NEWS_WEIGHT * _news(before.seen, seen))
 
@@ -239,7 +247,9 @@ class TrackFilter:
 
         likelihoods, likelihood_elsewhere = _likelihoods(targets, evidence, count)
         in_map = float(predicted.sum()) + predicted_elsewhere
-        weights, weight_elsewhere = likelihoods**weight, likelihood_elsewhere**weight
+        stretches = _stretch_likelihoods(targets, predicted, likelihoods)
+        weights = likelihoods * stretches ** (weight - 1)
+        weight_elsewhere = likelihood_elsewhere**weight
         fit = float(predicted @ weights) + predicted_elsewhere * weight_elsewhere
         outside_gain = OUTSIDE_GAIN * max(0.0, before.gain - CHANCE_GAIN)
         weight_outside = np.exp(weight * outside_gain) if evidence.hits else 1.0
@@ -266,6 +276,8 @@ class TrackFilter:
         )
         state = track_state(after, targets.take(kept), self._scheme, self._motion.typical_speed_mps)
         after = replace(after, status=next_status(before.status, state.probability, after.outside))
+        if seconds > 0 and evidence.odometry is None:
+            after = self._learn_pace(after, own, kernel * weights, sources, targets, seconds)
         if evidence.hits and in_map > 0:
             after = _learn_gain(after, float(np.log(fit / in_map)), weight, state.probability)
         return _Step(
@@ -280,6 +292,35 @@ class TrackFilter:
             weight_outside,
             after,
         )
+
+    def _learn_pace(
+        self,
+        belief: Belief,
+        own: FloatArray,
+        flow: FloatArray,
+        sources: PhotoTable,
+        targets: PhotoTable,
+        seconds: float,
+    ) -> Belief:
+        """Move the pace of a belief to the mean one of its last step along the map's sequences.
+
+        Args:
+            own: (n,) probabilities of the sources before the step.
+            flow: (n, m) probabilities to move to a target, times its likelihood.
+        """
+        motion = self._motion
+        gaps = signed_gap_seconds(sources, targets)
+        reached = np.abs(gaps) * motion.typical_speed_mps <= self._reach_m(seconds, None)
+        reached &= np.isnan(sources.latitudes)[:, None] | np.isnan(targets.latitudes)
+        flow = own[:, None] * flow
+        total = float(flow.sum())
+        if not (reached.any() and total > 0):
+            return belief
+        limit = motion.max_speed_mps / motion.typical_speed_mps
+        moved = float((flow * np.where(reached, gaps / seconds - belief.pace, 0.0)).sum()) / total
+        known = belief.probabilities.sum()
+        pace = belief.pace + known * moved / PACE_FRAMES
+        return replace(belief, pace=float(np.clip(pace, -limit, limit)))
 
     def _reach_m(self, seconds: float, odometry: Odometry | None) -> float:
         if odometry is not None:
@@ -311,6 +352,7 @@ class TrackFilter:
         complete_m: float,
         seconds: float,
         evidence: FrameEvidence,
+        pace: float,
     ) -> FloatArray:
         """Return (n, m) probabilities to move from source to target photos.
 
@@ -321,7 +363,13 @@ class TrackFilter:
         for first in range(0, len(sources), KERNEL_ROWS):
             rows = np.arange(first, min(first + KERNEL_ROWS, len(sources)))
             kernel[rows], moving = self._kernel_rows(
-                sources.take(rows), targets, numbers, complete_m, seconds, evidence.odometry
+                sources.take(rows),
+                targets,
+                numbers,
+                complete_m,
+                seconds,
+                evidence.odometry,
+                pace,
             )
             kernel[rows, rows] += 1 - moving  # the sources are the first targets
         return kernel
@@ -334,6 +382,7 @@ class TrackFilter:
         complete_m: float,
         seconds: float,
         odometry: Odometry | None,
+        pace: float,
     ) -> tuple[FloatArray, FloatArray]:
         """Return (n, m) probabilities to move, and (n,) how probable it is to move at all.
 
@@ -347,6 +396,12 @@ class TrackFilter:
             width = float(np.hypot(SPACING_M, moved_m / 2))
             weigh = partial(_gaussian, width=width)
             kernel = weigh(away)
+            gaps = _gaps_along(sources, targets, away, self._motion.typical_speed_mps)
+            typical_m = self._motion.typical_speed_mps * seconds
+            along = _gaussian(
+                gaps - pace * typical_m, math.hypot(SPACING_M, PACE_SPREAD * typical_m)
+            )
+            kernel = np.where(np.isnan(gaps), kernel, along)
         else:
             moved_m = odometry.distance_m + odometry.distance_accuracy_m
             weigh = partial(_odometry_weights, odometry=odometry)
@@ -407,6 +462,16 @@ def _gaussian(away: FloatArray, width: float) -> FloatArray:
     return weights
 
 
+def _gaps_along(
+    sources: PhotoTable, targets: PhotoTable, away: FloatArray, typical_speed_mps: float
+) -> FloatArray:
+    """Return (n, m) signed metres along the map's sequences; NaN where another way is shorter."""
+    gaps = signed_gap_seconds(sources, targets) * typical_speed_mps
+    located = ~np.isnan(sources.latitudes)[:, None] & ~np.isnan(targets.latitudes)
+    gaps[located | (np.abs(gaps) > away)] = np.nan
+    return gaps
+
+
 def _odometry_weights(away: FloatArray, odometry: Odometry) -> FloatArray:
     """Weigh distances by odometry. The distance between the ends may be shorter than the path."""
     width = np.hypot(odometry.distance_accuracy_m, SPACING_M)
@@ -459,6 +524,29 @@ def _likelihoods(
     other = max(0.0, 1 - sum(probability.values())) / max(count - len(probability), 1)
     values = np.array([probability.get(photo, other) for photo in targets.ids], dtype=np.float64)
     return np.maximum(values * count, 1e-9), max(other * count, 1e-9)
+
+
+def _stretch_likelihoods(
+    targets: PhotoTable, predicted: FloatArray, likelihoods: FloatArray
+) -> FloatArray:
+    """Return the likelihood of the stretch around each photo: the mean over its predicted photos.
+
+    A stretch is what the map's sequence shows within STRETCH_SECONDS. A photo with coordinates, or
+    without a sequence, is a stretch of its own.
+    """
+    means = likelihoods.copy()
+    chained = np.isnan(targets.latitudes) & ~np.isnan(targets.seconds)
+    for name in set(targets.sequences[chained].tolist()) - {None}:
+        rows = np.flatnonzero(chained & (targets.sequences == name))
+        rows = rows[np.argsort(targets.seconds[rows], kind="stable")]
+        seconds = targets.seconds[rows]
+        first = np.searchsorted(seconds, seconds - STRETCH_SECONDS, "left")
+        last = np.searchsorted(seconds, seconds + STRETCH_SECONDS, "right")
+        sums = np.zeros((2, len(rows) + 1))
+        np.cumsum([predicted[rows], predicted[rows] * likelihoods[rows]], axis=1, out=sums[:, 1:])
+        prior, joint = sums[:, last] - sums[:, first]
+        means[rows] = np.where(prior > 1e-12, joint / np.maximum(prior, 1e-12), likelihoods[rows])
+    return np.maximum(means, 1e-9)
 
 
 def _learn_gain(belief: Belief, log_fit: float, weight: float, tracked: float) -> Belief:

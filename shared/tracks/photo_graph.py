@@ -186,14 +186,21 @@ def _nearest_seconds(photos: PhotoTable, members: PhotoTable) -> FloatArray:
 
 def _gap_seconds(a: PhotoTable, b: PhotoTable) -> FloatArray:
     """Return (n, m) seconds between photos of the same sequence; infinite for others."""
+    return np.nan_to_num(np.abs(signed_gap_seconds(a, b)), nan=np.inf)
+
+
+def signed_gap_seconds(a: PhotoTable, b: PhotoTable) -> FloatArray:
+    """Return (n, m) seconds from each photo of `a` to each of `b`, negative where that is earlier.
+
+    NaN for photos of different sequences.
+    """
     codes = {name: code for code, name in enumerate(set(a.sequences) | set(b.sequences))}
     left = np.array([codes[name] for name in a.sequences], dtype=np.int64)
     right = np.array([codes[name] for name in b.sequences], dtype=np.int64)
-    gaps = np.abs(a.seconds[:, None] - b.seconds[None, :])
-    comparable = (left[:, None] == right[None, :]) & ~np.isnan(gaps)
+    comparable = left[:, None] == right[None, :]
     if None in codes:
         comparable &= (left != codes[None])[:, None]
-    return np.where(comparable, gaps, np.inf)
+    return np.where(comparable, b.seconds[None, :] - a.seconds[:, None], np.nan)
 
 
 class ArrayPhotoGraph:
