@@ -19,7 +19,7 @@ from shared.descriptors.backbones import Backbone, StoredWeights, normalise_feat
 from shared.extractor_config.configs import THUMBNAIL_PATCH as PATCH
 from shared.extractor_config.configs import ExtractorConfig
 
-MIN_STD = 16.0
+MIN_STD = 64.0
 """Standard deviation in grey levels; a patch below is noise and is not scaled up to 1"""
 
 
