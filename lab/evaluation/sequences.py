@@ -11,6 +11,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.datasets.ground_truth import parse_rule
 from lab.evaluation.confidence_metrics import recall_at_precision
-from lab.evaluation.seqslam import seqslam_matches
+from lab.evaluation.seqslam import hmm_matches, seqslam_matches
 from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.levels import LevelScheme
 from shared.search_api.background import background_frames, subtract_background
@@ -41,6 +42,10 @@ KIDNAPS = 6
 FOUND_FRAMES = 40
 """frames after which a track that was carried away must be right again"""
 SEQSLAM_CELL_M = 12.0
+HMM_FRAMES = 2.0
+"""that the hidden Markov model moves in a step, at most, along a map without coordinates"""
+STOPS = 4
+STOP_FRAMES = 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +59,7 @@ class FrameResult:
     """whether the track begins here: first frame, back in the map, or carried away"""
     single_is_right: bool
     seqslam_is_right: bool
+    hmm_is_right: bool
     filter_is_right: bool
     smoothed_is_right: bool
     single_score: float
@@ -123,15 +129,14 @@ def evaluate_sequence(
     """Follow one sequence.
 
     Args:
-        members: Query indices in the order of frames.
+        members: Query indices in the order of frames; one may come again, as of another frame.
         rows: (len(members), D) descriptors of these queries, of unit length.
 
     Returns:
         The frames, and the CPU seconds of the filter per frame.
     """
-    queries = [evaluation_set.queries[index] for index in members]
     scores = rows @ map_.rows.T
-    evidence = _frames_of(map_, _times(queries), rows)
+    evidence = _frames_of(map_, _times([evaluation_set.queries[n] for n in members]), rows)
     track_filter = TrackFilter(map_.graph, motion, map_.scheme)
     belief: Belief | None = None
     states = []
@@ -141,7 +146,7 @@ def evaluate_sequence(
         states.append(track_filter.state(belief))
     seconds = (time.process_time() - started) / max(len(evidence), 1)
     smoothed = track_filter.smoothed_states(evidence)
-    sequence_matches = _seqslam(map_, scores, motion)
+    matches = _peers(map_, scores, motion)
     results = []
     for number, index in enumerate(members):
         positives = set(evaluation_set.positives[index].tolist())
@@ -151,7 +156,8 @@ def evaluate_sequence(
                 has_positive=bool(positives),
                 is_start=bool(positives) and _is_start(evaluation_set, members, number),
                 single_is_right=int(scores[number].argmax()) in positives,
-                seqslam_is_right=int(sequence_matches[number]) in positives,
+                seqslam_is_right=int(matches["seqslam"][number]) in positives,
+                hmm_is_right=int(matches["hmm"][number]) in positives,
                 filter_is_right=_photo(states[number].photo) in positives,
                 smoothed_is_right=_photo(smoothed[number].photo) in positives,
                 single_score=float(scores[number].max()),
@@ -160,6 +166,22 @@ def evaluate_sequence(
             )
         )
     return results, seconds
+
+
+def resample(members: Sequence[int]) -> dict[str, list[int]]:
+    """Return a sequence at other paces, with stops, and from its middle, by a title of each."""
+    count = len(members)
+    stops = {(2 * n + 1) * count // (2 * STOPS) for n in range(STOPS)}
+    frames = {
+        f"at {pace:g} of the pace": np.arange(0, count, pace).astype(int)
+        for pace in (0.5, 0.75, 1.5)
+    } | {
+        f"{STOPS} stops of {STOP_FRAMES} frames": np.repeat(
+            np.arange(count), [STOP_FRAMES if n in stops else 1 for n in range(count)]
+        ),
+        "from the middle": np.arange(count // 2, count),
+    }
+    return {title: [members[n] for n in numbers] for title, numbers in frames.items()}
 
 
 def evaluate_kidnapped(
@@ -188,9 +210,8 @@ def evaluate_kidnapped(
         return []
     starts = np.random.default_rng(0).integers(len(inside), size=KIDNAPS + 1).tolist()
     frames = [inside[(start + n) % len(inside)] for start in starts for n in range(every)]
-    times = _times([evaluation_set.queries[index] for index in members])
-    interval = (times[-1] - times[0]) / (len(times) - 1)
-    evidence = _frames_of(map_, [times[0] + n * interval for n in range(len(frames))], rows[frames])
+    times = _times([evaluation_set.queries[members[n]] for n in frames])
+    evidence = _frames_of(map_, times, rows[frames])
     track_filter = TrackFilter(map_.graph, motion, map_.scheme)
     belief: Belief | None = None
     found: list[int | None] = [None] * (KIDNAPS + 1)
@@ -227,12 +248,20 @@ def _frames_of(map_: SequenceMap, times: Sequence[datetime], rows: Rows) -> list
 
 
 def _times(queries: Sequence[DatasetPhoto]) -> list[datetime]:
-    """Return capture times; without them, frame numbers count seconds."""
-    captured = [photo.captured_at for photo in queries if photo.captured_at is not None]
-    if len(captured) == len(queries):
-        return captured
+    """Return capture times; without them, frame numbers count seconds.
+
+    Frames that are no later than the one before are resampled: all are the usual interval apart.
+    """
     start = datetime(2000, 1, 1, tzinfo=UTC)
-    return [start + timedelta(seconds=photo.frame or 0) for photo in queries]
+    times = [photo.captured_at for photo in queries if photo.captured_at is not None]
+    if len(times) < len(queries):
+        times = [start + timedelta(seconds=photo.frame or 0) for photo in queries]
+    intervals = [after - before for before, after in pairwise(times)]
+    positive = sorted(each for each in intervals if each > timedelta())
+    if len(positive) == len(intervals):
+        return times
+    usual = positive[len(positive) // 2] if positive else timedelta(seconds=1)
+    return [start + n * usual for n in range(len(queries))]
 
 
 def _is_start(evaluation_set: EvaluationSet, members: Sequence[int], number: int) -> bool:
@@ -246,14 +275,20 @@ def _is_start(evaluation_set: EvaluationSet, members: Sequence[int], number: int
     return bool(np.hypot(*(metres[1] - metres[0])) > JUMP_M)  # not for unknown ones, NaN
 
 
-def _seqslam(map_: SequenceMap, scores: Rows, motion: MotionModel) -> NDArray[np.int64]:
+def _peers(map_: SequenceMap, scores: Rows, motion: MotionModel) -> dict[str, NDArray[np.int64]]:
+    """Return the matches of SeqSLAM and of the hidden Markov model."""
     eastings = np.array([photo.easting for photo in map_.photos], dtype=np.float64)
     northings = np.array([photo.northing for photo in map_.photos], dtype=np.float64)
-    if not np.isnan(eastings).any():
-        positions = np.stack([eastings, northings], axis=1)
-        return seqslam_matches(scores, positions, motion.typical_speed_mps, SEQSLAM_CELL_M)
-    order = np.arange(len(map_.photos), dtype=np.float64)[:, None]
-    return seqslam_matches(scores, order, 1.0, 1.0)
+    positions, step, cell = np.stack([eastings, northings], axis=1), motion.typical_speed_mps, 1.0
+    if np.isnan(eastings).any():
+        positions, step = np.arange(len(map_.photos), dtype=np.float64)[:, None], 1.0
+        reach = HMM_FRAMES
+    else:
+        cell, reach = SEQSLAM_CELL_M, motion.max_speed_mps
+    return {
+        "seqslam": seqslam_matches(scores, positions, step, cell),
+        "hmm": hmm_matches(scores, positions, reach),
+    }
 
 
 def _photo(photo: str | None) -> int:
@@ -283,7 +318,7 @@ def sequence_figures(sequences: Sequence[Sequence[FrameResult]]) -> dict[str, An
         "frames_outside": len(frames) - len(inside),
         "recall": {
             name: _share([getattr(frame, f"{name}_is_right") for frame in inside])
-            for name in ("single", "seqslam", "filter", "smoothed")
+            for name in ("single", "seqslam", "hmm", "filter", "smoothed")
         },
         "recall_at_99_precision": {
             "single": recall_at_precision(

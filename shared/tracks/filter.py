@@ -15,7 +15,7 @@ Update. The frame's evidence has posterior probabilities q of a single frame tha
 its prior is uniform, so n * q(j) is the likelihood up to a factor (Bayes' rule):
 
     p(j)      ~ p'(j) * (n * q(j)) ** w
-    outside   ~ outside' * exp(w * OUTSIDE_GAIN * max(0, g - CHANCE_GAIN))
+    outside   ~ outside' * exp(w * OUTSIDE_GAIN * max(0, min(g, MAX_GAIN) - CHANCE_GAIN))
 
 Photos that are no hits share what the hits leave. Outside the map, frames fit the predicted places
 by chance only, yet better than any place: similar streets look similar in successive frames. So
@@ -75,6 +75,8 @@ OUTSIDE_GAIN = 0.7
 """Share of the track's gain above CHANCE_GAIN that a frame outside the map must fall below"""
 CHANCE_GAIN = 0.45
 """A track that gains no more than this by its frames is not distinguishable from one outside"""
+MAX_GAIN = 2.0
+"""Where most frames gain more, one in a tunnel gains far less, and is still in the map"""
 MAX_GAIN_WEIGHT = 200.0
 """Number of frames that the gain is the mean of, at most: it follows the light and the weather"""
 NEWS_WEIGHT = 1.5
@@ -251,7 +253,7 @@ class TrackFilter:
         weights = likelihoods * stretches ** (weight - 1)
         weight_elsewhere = likelihood_elsewhere**weight
         fit = float(predicted @ weights) + predicted_elsewhere * weight_elsewhere
-        outside_gain = OUTSIDE_GAIN * max(0.0, before.gain - CHANCE_GAIN)
+        outside_gain = OUTSIDE_GAIN * max(0.0, min(before.gain, MAX_GAIN) - CHANCE_GAIN)
         weight_outside = np.exp(weight * outside_gain) if evidence.hits else 1.0
         if evidence.fix is not None:
             near, elsewhere_near = _fix_weights(targets, evidence.fix, fix_complete_m, count)

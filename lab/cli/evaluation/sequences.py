@@ -15,10 +15,12 @@ from lab.datasets.dataset import EvaluationSet
 from lab.datasets.open_dataset import evaluation_set_names, open_evaluation_set
 from lab.evaluation.ranking import describe_evaluation_set
 from lab.evaluation.sequences import (
+    FrameResult,
     evaluate_kidnapped,
     evaluate_sequence,
     kidnapping_figures,
     prepare_map,
+    resample,
     sequence_figures,
     split_sequences,
 )
@@ -39,9 +41,11 @@ from shared.tracks.motion import MotionModel
 METHODS = {
     "single": "single frames",
     "seqslam": "SeqSLAM, constant velocity",
+    "hmm": "hidden Markov model",
     "filter": "filter",
     "smoothed": "filter, forward and backward",
 }
+RESAMPLED = ("filter", "tracking", "right among them", "ECE")
 
 
 def evaluate_sequences(
@@ -103,12 +107,17 @@ def _evaluate_set(
         database, queries = (_normalise(rows) for rows in matrices)
     map_ = prepare_map(evaluation_set, database, motion)
     sequences, milliseconds = [], []
+    resampled: dict[str, list[list[FrameResult]]] = {}
     found: list[int | None] = []
     members_of = split_sequences(evaluation_set.queries)
+    photos_without_positions = any(photo.latitude is None for photo in evaluation_set.database)
     for number, members in enumerate(members_of):
         frames, seconds = evaluate_sequence(map_, evaluation_set, members, queries[members], motion)
         sequences.append(frames)
         milliseconds.append(1000 * seconds)
+        for title, again in resample(members).items() if photos_without_positions else ():
+            follow = evaluate_sequence(map_, evaluation_set, again, queries[again], motion)
+            resampled.setdefault(title, []).append(follow[0])
         if kidnap_every is not None:
             found += evaluate_kidnapped(
                 map_, evaluation_set, members, queries[members], motion, kidnap_every
@@ -123,6 +132,7 @@ def _evaluate_set(
         "database": len(database),
         "filter_ms_a_frame": statistics.fmean(milliseconds),
         **sequence_figures(sequences),
+        "resampled": {title: sequence_figures(frames) for title, frames in resampled.items()},
         **({} if kidnap_every is None else kidnapping_figures(found)),
         "sequences": by_sequence,
     }
@@ -147,6 +157,13 @@ def _print_figures(name: str, figures: Json) -> None:
         precise = figures["recall_at_99_precision"].get(key)
         table.add_row(title, format_percent(figures["recall"][key]), format_percent(precise))
     print_table(table)
+    if figures["resampled"]:
+        table = Table("the ride again", *(Column(title, justify="right") for title in RESAMPLED))
+        for title, again in figures["resampled"].items():
+            recall, precision = again["recall"]["filter"], again["tracking_precision"]
+            shares = (recall, again["tracking"], precision)
+            table.add_row(title, *map(format_percent, shares), f"{again['calibration_error']:.3f}")
+        print_table(table)
     rows = {
         "frames in the map with the status tracking": format_percent(figures["tracking"]),
         "right among them": format_percent(figures["tracking_precision"]),

@@ -20,6 +20,7 @@ from shared.tracks.filter import (
     CHANCE_GAIN,
     ENTERING,
     LEAVING,
+    MAX_GAIN,
     NEWS_WEIGHT,
     OUTSIDE_GAIN,
     SPACING_M,
@@ -60,7 +61,7 @@ def brute_force(frames: list[FrameEvidence]) -> NDArray[np.float64]:
     for each in frames:
         gains.append(belief.gain if belief else START_GAIN)
         belief = TrackFilter(line_map(COUNT), WALK).advance(belief, each)
-    outside = np.exp(OUTSIDE_GAIN * np.maximum(0.0, np.array(gains) - CHANCE_GAIN))
+    outside = np.exp(OUTSIDE_GAIN * np.maximum(0.0, np.minimum(gains, MAX_GAIN) - CHANCE_GAIN))
     likelihood = np.column_stack([shown * COUNT, outside])
     new = np.ones(len(frames))
     for step in range(1, len(frames)):
