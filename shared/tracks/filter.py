@@ -43,6 +43,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -131,6 +132,14 @@ class _Step:
     weight_elsewhere: float
     weight_outside: float
     belief: Belief
+
+
+class _Place(NamedTuple):
+    """The most probable place along the map's sequences."""
+
+    sequence: str
+    seconds: float
+    probability: float
 
 
 class TrackFilter:
@@ -273,13 +282,15 @@ class TrackFilter:
             seen=seen,
             gain=before.gain,
             gain_weight=before.gain_weight,
+            pace=before.pace,
             status=before.status,
             frames=before.frames + 1,
         )
         state = track_state(after, targets.take(kept), self._scheme, self._motion.typical_speed_mps)
         after = replace(after, status=next_status(before.status, state.probability, after.outside))
-        if seconds > 0 and evidence.odometry is None:
-            after = self._learn_pace(after, own, kernel * weights, sources, targets, seconds)
+        after = self._learn_pace(
+            after, _place(sources, own), _place(targets.take(kept), posterior[kept]), seconds
+        )
         if evidence.hits and in_map > 0:
             after = _learn_gain(after, float(np.log(fit / in_map)), weight, state.probability)
         return _Step(
@@ -296,32 +307,17 @@ class TrackFilter:
         )
 
     def _learn_pace(
-        self,
-        belief: Belief,
-        own: FloatArray,
-        flow: FloatArray,
-        sources: PhotoTable,
-        targets: PhotoTable,
-        seconds: float,
+        self, belief: Belief, before: _Place | None, after: _Place | None, seconds: float
     ) -> Belief:
-        """Move the pace of a belief to the mean one of its last step along the map's sequences.
-
-        Args:
-            own: (n,) probabilities of the sources before the step.
-            flow: (n, m) probabilities to move to a target, times its likelihood.
-        """
-        motion = self._motion
-        gaps = signed_gap_seconds(sources, targets)
-        reached = np.abs(gaps) * motion.typical_speed_mps <= self._reach_m(seconds, None)
-        reached &= np.isnan(sources.latitudes)[:, None] | np.isnan(targets.latitudes)
-        flow = own[:, None] * flow
-        total = float(flow.sum())
-        if not (reached.any() and total > 0):
+        """Move the pace of a belief towards that between two places of a sequence."""
+        if before is None or after is None or before.sequence != after.sequence or seconds <= 0:
             return belief
-        limit = motion.max_speed_mps / motion.typical_speed_mps
-        moved = float((flow * np.where(reached, gaps / seconds - belief.pace, 0.0)).sum()) / total
-        known = belief.probabilities.sum()
-        pace = belief.pace + known * moved / PACE_FRAMES
+        limit = self._motion.max_speed_mps / self._motion.typical_speed_mps
+        seen = (after.seconds - before.seconds) / seconds
+        if abs(seen) > limit + STRETCH_SECONDS / seconds:
+            return belief  # carried away
+        certainty = min(before.probability, after.probability)
+        pace = belief.pace + certainty * (seen - belief.pace) / PACE_FRAMES
         return replace(belief, pace=float(np.clip(pace, -limit, limit)))
 
     def _reach_m(self, seconds: float, odometry: Odometry | None) -> float:
@@ -526,6 +522,18 @@ def _likelihoods(
     other = max(0.0, 1 - sum(probability.values())) / max(count - len(probability), 1)
     values = np.array([probability.get(photo, other) for photo in targets.ids], dtype=np.float64)
     return np.maximum(values * count, 1e-9), max(other * count, 1e-9)
+
+
+def _place(photos: PhotoTable, probabilities: FloatArray) -> _Place | None:
+    """Return the mean place around the most probable photo; None if it is in no sequence."""
+    best = int(probabilities.argmax()) if len(probabilities) else -1
+    if best < 0 or np.isnan(photos.seconds[best]) or not np.isnan(photos.latitudes[best]):
+        return None
+    around = np.abs(photos.seconds - photos.seconds[best]) <= STRETCH_SECONDS
+    around &= photos.sequences == photos.sequences[best]
+    total = float(probabilities[around].sum())
+    seconds = float(probabilities[around] @ photos.seconds[around]) / max(total, 1e-12)
+    return _Place(photos.sequences[best], seconds, total)
 
 
 def _stretch_likelihoods(

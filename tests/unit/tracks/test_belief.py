@@ -59,11 +59,11 @@ def test_a_belief_of_a_newer_release_is_an_error_that_names_both_formats() -> No
         Belief.from_bytes(newer)
 
 
-def test_a_belief_of_the_release_before_is_read_with_the_gain_of_a_new_track() -> None:
-    content = json.loads(zlib.decompress(belief(gain=2.0, gain_weight=50.0).to_bytes()))
-    del content["gain"], content["gain_weight"]
+def test_a_belief_of_a_release_before_is_read_with_the_gain_and_pace_of_a_new_track() -> None:
+    content = json.loads(zlib.decompress(belief(gain=2.0, gain_weight=50.0, pace=2.0).to_bytes()))
+    del content["gain"], content["gain_weight"], content["pace"]
     older = zlib.compress(json.dumps(content | {"version": 1}).encode())
-    assert Belief.from_bytes(older).gain == START_GAIN
+    assert (Belief.from_bytes(older).gain, Belief.from_bytes(older).pace) == (START_GAIN, 1.0)
 
 
 def test_the_probabilities_of_a_frame_and_of_all_other_photos_add_up_to_one() -> None:

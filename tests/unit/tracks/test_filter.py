@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
 from shared.geodesy import EARTH_RADIUS_M
 from shared.tracks import filter as filter_module
@@ -272,6 +273,37 @@ def test_sequences_without_coordinates_are_followed_along_their_own_time() -> No
         photo = track_filter.state(belief).photo
         right += photo is not None and abs(int(photo) - 300 - step) <= 10
     assert right > 40
+
+
+def follow_film(shown: list[int], count: int = 400) -> tuple[list[int], Belief]:
+    """Follow a ride along a film whose frames resemble the photos around the right one."""
+    rng = np.random.default_rng(1)
+    scheme = LevelScheme(labels_are_paths=False, radii_m=(200.0,))
+    track_filter = TrackFilter(sequence_map(count), MOTION_MODELS["train"], scheme)
+    belief, found = None, []
+    places, noise = np.arange(count), rng.normal(size=(count, count))
+    for step, photo in enumerate(shown):
+        # The same photo is the same view again, with the same resemblances.
+        likeness = np.exp(4 * np.exp(-0.5 * ((places - photo) / 1.5) ** 2) + 0.8 * noise[photo])
+        belief = track_filter.advance(belief, frame(step, (likeness / likeness.sum()).tolist()))
+        found.append(int(track_filter.state(belief).photo or -1))
+    assert belief is not None
+    return found, belief
+
+
+@pytest.mark.parametrize("pace", [0.5, 1.5, 2.5, -1.0])
+def test_the_pace_along_a_sequence_is_learned_within_the_limit_of_the_motion(pace: float) -> None:
+    shown = [int(200 - 60 * pace + pace * step) for step in range(120)]
+    found, belief = follow_film(shown)
+    assert np.mean(np.abs(np.array(found) - shown)[30:] <= 5) > 0.9
+    assert belief.pace == pytest.approx(pace, abs=0.4)
+
+
+def test_a_camera_that_stands_is_not_moved_on_by_the_pace_it_had() -> None:
+    shown = [*range(50, 110), *[110] * 30, *range(110, 140)]
+    found, belief = follow_film(shown)
+    assert np.mean(np.abs(np.array(found) - shown)[30:] <= 5) > 0.95
+    assert belief.status == "tracking"
 
 
 @pytest.mark.parametrize("seed", range(20))
