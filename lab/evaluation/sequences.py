@@ -23,7 +23,7 @@ from lab.evaluation.confidence_metrics import recall_at_precision
 from lab.evaluation.seqslam import hmm_matches, seqslam_matches
 from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.levels import LevelScheme
-from shared.search_api.background import background_frames, subtract_background
+from shared.search_api.background import PRIOR_ROWS, background_frames
 from shared.tracks.belief import Belief, TrackStatus
 from shared.tracks.evidence import HITS, FrameEvidence, frame_evidence
 from shared.tracks.filter import TrackFilter
@@ -76,6 +76,11 @@ class SequenceMap:
     """(n, D), of unit length"""
     graph: ArrayPhotoGraph
     scheme: LevelScheme
+
+    @property
+    def has_coordinates(self) -> bool:
+        """Whether all photos have coordinates."""
+        return all(photo.latitude is not None for photo in self.photos)
 
 
 def prepare_map(evaluation_set: EvaluationSet, rows: Rows, motion: MotionModel) -> SequenceMap:
@@ -136,7 +141,7 @@ def evaluate_sequence(
         The frames, and the CPU seconds of the filter per frame.
     """
     scores = rows @ map_.rows.T
-    evidence = _frames_of(map_, _times([evaluation_set.queries[n] for n in members]), rows)
+    evidence = _frames_of(map_, _times([evaluation_set.queries[n] for n in members]), scores)
     track_filter = TrackFilter(map_.graph, motion, map_.scheme)
     belief: Belief | None = None
     states = []
@@ -211,7 +216,7 @@ def evaluate_kidnapped(
     starts = np.random.default_rng(0).integers(len(inside), size=KIDNAPS + 1).tolist()
     frames = [inside[(start + n) % len(inside)] for start in starts for n in range(every)]
     times = _times([evaluation_set.queries[members[n]] for n in frames])
-    evidence = _frames_of(map_, times, rows[frames])
+    evidence = _frames_of(map_, times, rows[frames] @ map_.rows.T)
     track_filter = TrackFilter(map_.graph, motion, map_.scheme)
     belief: Belief | None = None
     found: list[int | None] = [None] * (KIDNAPS + 1)
@@ -225,25 +230,25 @@ def evaluate_kidnapped(
     return found[1:]  # before the first jump
 
 
-def _frames_of(map_: SequenceMap, times: Sequence[datetime], rows: Rows) -> list[FrameEvidence]:
+def _frames_of(map_: SequenceMap, times: Sequence[datetime], scores: Rows) -> list[FrameEvidence]:
     """Return the evidence of the frames of a sequence.
+
+    Scores are linear, so that the background is subtracted from them instead of from the
+    descriptors, which are much longer. That leaves out a factor for each frame, on which its
+    evidence does not depend.
 
     Args:
         times: (n,) when the frames were taken.
-        rows: (n, D) their descriptors, of unit length.
+        scores: (n, photos) of the frames.
     """
-    centred = np.stack(
-        [
-            subtract_background(row, rows[background_frames(number)])
-            for number, row in enumerate(rows)
-        ]
-    )
-    count = min(HITS, len(map_.rows))
+    count = min(HITS, scores.shape[1])
     frames = []
-    for time_, scores in zip(times, centred @ map_.rows.T, strict=True):
-        order = np.argsort(-scores, kind="stable")[:count]
-        found = scores[order].astype(np.float64).tolist()
-        frames.append(frame_evidence(time_, [str(photo) for photo in order], found, len(scores)))
+    for number, (time_, own) in enumerate(zip(times, scores, strict=True)):
+        background = background_frames(number)
+        centred = own - scores[background].sum(axis=0) / (len(background) + PRIOR_ROWS)
+        order = np.argsort(-centred, kind="stable")[:count]
+        found = centred[order].astype(np.float64).tolist()
+        frames.append(frame_evidence(time_, [str(photo) for photo in order], found, len(own)))
     return frames
 
 

@@ -44,6 +44,9 @@ class Belief:
     """number of independent, tracked frames that `gain` is the mean of"""
     pace: float = 1.0
     """seconds along the map's sequences for each second of the track, negative backwards"""
+    direction: float = 0.0
+    """log-likelihood of the frames so far if the camera moves along the map's sequence as it did,
+    relative to the opposite direction; the oldest frames fade"""
     status: TrackStatus = "converging"
     frames: int = 0
     """number of frames so far"""

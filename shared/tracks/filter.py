@@ -64,7 +64,7 @@ from shared.tracks.photo_graph import (
     signed_gap_seconds,
     unit_vectors,
 )
-from shared.tracks.state import TrackState, next_status, track_state
+from shared.tracks.state import TrackState, follows_sequence, next_status, track_state
 
 CARRIED_AWAY = 0.002
 """Probability per frame that the camera goes on at any place of the map"""
@@ -89,6 +89,8 @@ PACE_SPREAD = 1.0
 """Standard deviation of a camera's pace around the learned one, in paces of the map"""
 PACE_FRAMES = 30.0
 """Number of tracked frames that the pace is the mean of"""
+DIRECTION_FRAMES = 50.0
+"""Number of frames with new evidence that say whether the camera moves along the map"""
 SPACING_M = 10.0
 """Standard deviation between a frame and the photo of the map that shows it"""
 MAX_REACH_M = 1000.0
@@ -210,8 +212,13 @@ class TrackFilter:
         The status follows from the smoothed probabilities, as that of `advance` does from those
         that were known at the frame.
         """
+        beliefs = self.smooth(frames, start)
+        for number in range(len(beliefs) - 2, -1, -1):
+            later = beliefs[number + 1].direction * (1 - 1 / DIRECTION_FRAMES)
+            if later > beliefs[number].direction:
+                beliefs[number] = replace(beliefs[number], direction=later)
         states: list[TrackState] = []
-        for belief in self.smooth(frames, start):
+        for belief in beliefs:
             state = self.state(belief)
             before = states[-1].status if states else start.status if start else "converging"
             status = next_status(before, state.probability, state.outside)
@@ -234,6 +241,9 @@ class TrackFilter:
             near_fix, fix_complete_m = _near_fix(self._graph, evidence.fix)
             targets = targets.union(near_fix)
         kernel = self._kernel(sources, targets, complete_m, seconds, evidence, before.pace)
+        backwards = None
+        if follows_sequence(targets).any():
+            backwards = self._kernel(sources, targets, complete_m, seconds, evidence, -before.pace)
         seen = _excess(evidence, count)
         weight = min(1.0, NEWS_WEIGHT * _news(before.seen, seen))
 
@@ -262,6 +272,11 @@ class TrackFilter:
         weights = likelihoods * stretches ** (weight - 1)
         weight_elsewhere = likelihood_elsewhere**weight
         fit = float(predicted @ weights) + predicted_elsewhere * weight_elsewhere
+        direction = before.direction
+        if backwards is not None:
+            reverse = stay * (own @ backwards + density * is_new) + entered
+            gained = math.log(float(predicted @ weights) / float(reverse @ weights))
+            direction = max(0.0, direction * (1 - weight / DIRECTION_FRAMES) + gained)
         outside_gain = OUTSIDE_GAIN * max(0.0, min(before.gain, MAX_GAIN) - CHANCE_GAIN)
         weight_outside = np.exp(weight * outside_gain) if evidence.hits else 1.0
         if evidence.fix is not None:
@@ -283,6 +298,7 @@ class TrackFilter:
             gain=before.gain,
             gain_weight=before.gain_weight,
             pace=before.pace,
+            direction=direction,
             status=before.status,
             frames=before.frames + 1,
         )
@@ -315,7 +331,7 @@ class TrackFilter:
         limit = self._motion.max_speed_mps / self._motion.typical_speed_mps
         seen = (after.seconds - before.seconds) / seconds
         if abs(seen) > limit + STRETCH_SECONDS / seconds:
-            return belief  # carried away
+            return replace(belief, direction=0.0)  # carried away
         certainty = min(before.probability, after.probability)
         pace = belief.pace + certainty * (seen - belief.pace) / PACE_FRAMES
         return replace(belief, pace=float(np.clip(pace, -limit, limit)))

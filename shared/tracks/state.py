@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shared.evaluation.places.levels import CandidateLevel, LevelScheme
 from shared.evaluation.places.probability import error_radius_m
@@ -18,6 +20,9 @@ from shared.tracks.photo_graph import FloatArray, PhotoTable, distance_matrix_m
 TRACKING_PROBABILITY = 0.8
 """From here on the place is tracked; a track is lost below 1/2"""
 KEPT_PROBABILITY = 0.5
+DIRECTION_ODDS = 3.0
+"""Log-odds that a camera moves along the map's sequence at which it is as probable as not: where
+descriptors mislead for many frames, the place stands still or moves as well backwards"""
 CENTERS = 100
 """Number of most probable photos that the best place is chosen among"""
 
@@ -87,7 +92,7 @@ def track_state(
     if labelled:
         levels, inside = _label_levels(photos, weights, scheme)
     else:
-        levels, inside = _circles(photos, weights, scheme, typical_speed_mps)
+        levels, inside = _circles(photos, weights, scheme, typical_speed_mps, belief.direction)
     best = int(np.where(inside, weights, -1.0).argmax())
     finest = levels[0]
     circles = [
@@ -113,6 +118,12 @@ def track_state(
     )
 
 
+def follows_sequence(photos: PhotoTable) -> NDArray[np.bool_]:
+    """Return (n,) whether a photo has no place but the one in its sequence."""
+    unplaced = np.isnan(photos.latitudes) & (photos.places == None)  # noqa: E711
+    return unplaced & ~np.isnan(photos.seconds)
+
+
 def _nowhere(belief: Belief) -> TrackState:
     return TrackState(
         belief.time, belief.status, None, None, None, None, None, 0.0, (), None, None,
@@ -121,7 +132,11 @@ def _nowhere(belief: Belief) -> TrackState:
 
 
 def _circles(
-    photos: PhotoTable, weights: FloatArray, scheme: LevelScheme, typical_speed_mps: float
+    photos: PhotoTable,
+    weights: FloatArray,
+    scheme: LevelScheme,
+    typical_speed_mps: float,
+    direction: float,
 ) -> tuple[list[TrackLevel], np.ndarray]:
     """Return circles around the place with the most probability, and the photos of the finest."""
     radii = sorted(scheme.radii_m)
@@ -140,9 +155,16 @@ def _circles(
         )
         center = PhotoTable.of_rows([("", latitude, longitude, None, None, None, None)])
         distances = distance_matrix_m(center, photos, typical_speed_mps)[0]
+    trust = 1.0
+    if follows_sequence(row)[0]:
+        trust = 1 / (1 + math.exp(DIRECTION_ODDS - direction))
     levels = [
         TrackLevel(
-            None, latitude, longitude, radius, min(1.0, float(weights[distances <= radius].sum()))
+            None,
+            latitude,
+            longitude,
+            radius,
+            trust * min(1.0, float(weights[distances <= radius].sum())),
         )
         for radius in radii
     ]

@@ -107,22 +107,28 @@ def _evaluate_set(
         database, queries = (_normalise(rows) for rows in matrices)
     map_ = prepare_map(evaluation_set, database, motion)
     sequences, milliseconds = [], []
-    resampled: dict[str, list[list[FrameResult]]] = {}
+    again: dict[str, list[list[FrameResult]]] = {}
     found: list[int | None] = []
     members_of = split_sequences(evaluation_set.queries)
-    photos_without_positions = any(photo.latitude is None for photo in evaluation_set.database)
-    for number, members in enumerate(members_of):
-        frames, seconds = evaluate_sequence(map_, evaluation_set, members, queries[members], motion)
-        sequences.append(frames)
-        milliseconds.append(1000 * seconds)
-        for title, again in resample(members).items() if photos_without_positions else ():
-            follow = evaluate_sequence(map_, evaluation_set, again, queries[again], motion)
-            resampled.setdefault(title, []).append(follow[0])
+    # Along a map with coordinates the pace is not learned.
+    rides = [
+        {"": members} | ({} if map_.has_coordinates else resample(members))
+        for members in members_of
+    ]
+    total, done = sum(map(len, rides)), 0
+    for ride in rides:
+        for title, frames in ride.items():
+            followed, seconds = evaluate_sequence(
+                map_, evaluation_set, frames, queries[frames], motion
+            )
+            (again.setdefault(title, []) if title else sequences).append(followed)
+            milliseconds.append(1000 * seconds)
+            on_progress("tracking", done := done + 1, total)
         if kidnap_every is not None:
+            members = ride[""]
             found += evaluate_kidnapped(
                 map_, evaluation_set, members, queries[members], motion, kidnap_every
             )
-        on_progress("tracking", number + 1, len(members_of))
     by_sequence = {
         str(evaluation_set.queries[members[0]].sequence): sequence_figures([frames])
         for members, frames in zip(members_of, sequences, strict=True)
@@ -132,7 +138,7 @@ def _evaluate_set(
         "database": len(database),
         "filter_ms_a_frame": statistics.fmean(milliseconds),
         **sequence_figures(sequences),
-        "resampled": {title: sequence_figures(frames) for title, frames in resampled.items()},
+        "resampled": {title: sequence_figures(frames) for title, frames in again.items()},
         **({} if kidnap_every is None else kidnapping_figures(found)),
         "sequences": by_sequence,
     }
