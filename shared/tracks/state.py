@@ -120,8 +120,9 @@ def track_state(
 
 def follows_sequence(photos: PhotoTable) -> NDArray[np.bool_]:
     """Return (n,) whether a photo has no place but the one in its sequence."""
-    unplaced = np.isnan(photos.latitudes) & (photos.places == None)  # noqa: E711
-    return unplaced & ~np.isnan(photos.seconds)
+    follows: NDArray[np.bool_] = np.isnan(photos.latitudes) & ~np.isnan(photos.seconds)
+    follows &= photos.places == None  # noqa: E711
+    return follows
 
 
 def _nowhere(belief: Belief) -> TrackState:

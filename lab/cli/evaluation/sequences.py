@@ -106,7 +106,8 @@ def _evaluate_set(
     ) as matrices:
         database, queries = (_normalise(rows) for rows in matrices)
     map_ = prepare_map(evaluation_set, database, motion)
-    sequences, milliseconds = [], []
+    sequences: list[list[FrameResult]] = []
+    milliseconds: list[float] = []
     again: dict[str, list[list[FrameResult]]] = {}
     found: list[int | None] = []
     members_of = split_sequences(evaluation_set.queries)

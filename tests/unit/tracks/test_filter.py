@@ -306,6 +306,26 @@ def test_a_camera_that_stands_is_not_moved_on_by_the_pace_it_had() -> None:
     assert belief.status == "tracking"
 
 
+def test_frames_that_mislead_to_the_same_photos_of_a_sequence_are_not_tracked() -> None:
+    """Each frame is new, but those of a minute all resemble the same few photos best."""
+    rng = np.random.default_rng(2)
+    track_filter = TrackFilter(
+        sequence_map(400),
+        MOTION_MODELS["train"],
+        LevelScheme(labels_are_paths=False, radii_m=(200.0,)),
+    )
+    belief, statuses = None, []
+    for step in range(180):
+        lure = 100 + 90 * (step // 60)
+        likeness = np.exp(rng.normal(size=400))
+        likeness[lure - 2 : lure + 3] *= rng.uniform(10, 60, 5)
+        belief = track_filter.advance(belief, frame(step, (likeness / likeness.sum()).tolist()))
+        statuses.append(belief.status)
+    assert belief is not None
+    assert statuses.count("tracking") < 9
+    assert track_filter.state(belief).probability < 0.5
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_probabilities_add_up_to_one_for_any_times_odometry_and_hits(seed: int) -> None:
     rng = np.random.default_rng(seed)
