@@ -328,11 +328,13 @@ class TrackFilter:
         """Move the pace of a belief towards that between two places of a sequence."""
         if before is None or after is None or before.sequence != after.sequence or seconds <= 0:
             return belief
+        certainty = min(before.probability, after.probability)
+        if certainty < 0.5:
+            return belief
         limit = self._motion.max_speed_mps / self._motion.typical_speed_mps
         seen = (after.seconds - before.seconds) / seconds
         if abs(seen) > limit + STRETCH_SECONDS / seconds:
             return replace(belief, direction=0.0)  # carried away
-        certainty = min(before.probability, after.probability)
         pace = belief.pace + certainty * (seen - belief.pace) / PACE_FRAMES
         return replace(belief, pace=float(np.clip(pace, -limit, limit)))
 
