@@ -40,6 +40,7 @@ from shared.jobs.queue_depth import PolledValue, QueueDepth, measure_queue_depth
 ADMISSION_POLL_SECONDS = 1.0
 RETRY_TARGET_SHARE = 0.9  # Retry-After: when the queue has shrunk to this share of its limit
 MAX_RETRY_SECONDS = 60
+UNKNOWN_RATE_RETRY_SECONDS = 5  # Retry-After while no job has finished within the last minute
 UPLOAD_RETRY_SECONDS = 1
 STREAM_RETRY_SECONDS = 10  # event streams last as long as their jobs
 MAX_SMOOTHED_TRACKS = 2  # at the same time: each competes with all other requests for the CPU
@@ -295,7 +296,7 @@ def _check_queue(what: str, queued: int, limit: int, depth: QueueDepth) -> None:
     if queued < limit:
         return
     excess, per_second = queued - RETRY_TARGET_SHARE * limit, depth.finished_per_second
-    seconds = excess / per_second if per_second > 0 else MAX_RETRY_SECONDS
+    seconds = excess / per_second if per_second > 0 else UNKNOWN_RATE_RETRY_SECONDS
     raise TooManyRequests(
         "queue_full",
         f"The queue is full: {queued} {what} are waiting, the limit is {limit}. Retry after the "

@@ -13,7 +13,12 @@ from fastapi import Request
 
 from services.extractor.worker import ExtractorWorker
 from services.gateway import admission
-from services.gateway.admission import MAX_RETRY_SECONDS, AdmissionControl, UploadKind
+from services.gateway.admission import (
+    MAX_RETRY_SECONDS,
+    UNKNOWN_RATE_RETRY_SECONDS,
+    AdmissionControl,
+    UploadKind,
+)
 from services.gateway.authentication import Caller
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
@@ -31,6 +36,7 @@ from tests.support.catalog_rows import add_job, add_map
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
 
+# tests/e2e/test_backpressure.py fills a queue on SQLite.
 pytestmark = pytest.mark.databases("postgresql")
 
 GIGABYTE = 1_000_000_000
@@ -199,7 +205,7 @@ def test_throughput_is_that_of_uploads_and_queries_finished_in_the_last_minute(
         (1000, 10.0, 10),  # 100 too many for nine tenths
         (1500, 10.0, 60),  # 600 too many
         (1000, 1000.0, 1),
-        (1000, 0.0, MAX_RETRY_SECONDS),  # nothing is finished: no one knows
+        (1000, 0.0, UNKNOWN_RATE_RETRY_SECONDS),  # no job has finished
     ],
 )
 def test_the_time_to_come_again_follows_from_the_queue_and_its_speed(
