@@ -183,6 +183,54 @@ class SearchStatus(_Message):
         return {key: value for key, value in self.versions.items() if key not in self.incomplete}
 
 
+class FeatureReference(_Message):
+    """Reference to the local features of a photo: row `row` of the feature file `object_key`."""
+
+    object_key: str
+    row: int = Field(ge=0)
+
+
+class MatchRequest(_Message):
+    """Request to match the local features of a query with those of photos, and to verify them.
+
+    The features of all must come from the same model.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    query: FeatureReference
+    candidates: tuple[FeatureReference, ...]
+    with_pairs: bool = False
+    """whether the inliers themselves are returned"""
+
+
+class PointPair(_Message):
+    """Two points that show the same spot, in pixels of the upright photos."""
+
+    query: tuple[float, float]
+    photo: tuple[float, float]
+
+
+class PhotoMatches(_Message):
+    """The matches of a query with one photo."""
+
+    matches: int
+    """pairs of keypoints that are most similar to each other"""
+    inliers: int
+    """those that agree with one camera motion"""
+    pairs: tuple[PointPair, ...] = ()
+    """the inliers, most similar first, if they were requested"""
+
+
+class MatchResponse(_Message):
+    """Result of a match request."""
+
+    candidates: tuple[PhotoMatches | None, ...]
+    """by candidate; None where its features are missing, damaged, or of another model"""
+    reason: str | None = None
+    """why the query itself can't be matched; then all candidates are None"""
+
+
 class SearchBackend(Protocol):
     """The search tier as its callers use it.
 
@@ -191,6 +239,9 @@ class SearchBackend(Protocol):
 
     def search(self, request: SearchRequest) -> SearchResponse:
         """Return the hits of one search."""
+
+    def match(self, request: MatchRequest) -> MatchResponse:
+        """Match local features, on any one worker: they are read from the object store."""
 
     def status(self) -> SearchStatus:
         """Return the state of the workers."""

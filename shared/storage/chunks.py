@@ -73,6 +73,11 @@ def codes_key(object_key: str) -> str:
     return object_key.removesuffix(".npy") + ".codes"
 
 
+def features_key(object_key: str) -> str:
+    """Return the key of the local features of a chunk's photos (`shared.storage.feature_files`)."""
+    return object_key.removesuffix(".npy") + ".features"
+
+
 def encode_rows(rows: StoredRows) -> bytes:
     """Encode (n, dimension) float32 or float16 rows as the bytes of a `.npy` file."""
     if rows.dtype not in ROW_DTYPES or rows.ndim != 2:
@@ -217,14 +222,14 @@ def read_rows(store: ObjectStore, object_key: str, rows: Sequence[int]) -> Rows:
         NotFound: the object is missing.
     """
     with store.open(object_key) as file:
-        (row_count, dimension), dtype, offset = _read_header(_read_up_to(file, HEADER_READ_BYTES))
+        (row_count, dimension), dtype, offset = _read_header(read_up_to(file, HEADER_READ_BYTES))
         size = dimension * dtype.itemsize
         vectors = np.empty((len(rows), dimension), dtype=np.float32)
         for position, row in enumerate(rows):
             if row >= row_count:
                 raise IndexError(row)
             file.seek(offset + row * size)
-            data = _read_up_to(file, size)
+            data = read_up_to(file, size)
             if len(data) < size:
                 raise ValueError(f"the object is {size - len(data)} bytes too short")
             vectors[position] = np.frombuffer(data, dtype=dtype)
@@ -237,7 +242,7 @@ def rows_are_valid(rows: StoredRows) -> NDArray[np.bool_]:
     return np.asarray((norms == 0) | (np.abs(norms - 1) < NORM_TOLERANCE))
 
 
-def _read_up_to(file: BinaryIO, size: int) -> bytes:
+def read_up_to(file: BinaryIO, size: int) -> bytes:
     """Read `size` bytes, fewer only at the end; one read of a network stream may return less."""
     blocks = []
     while size and (block := file.read(size)):

@@ -1,0 +1,50 @@
+"""Matchers: which keypoint of one photo is which of another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.matching.features import QUANTISATION, LocalFeatures
+
+MIN_COSINES = {"xfeat": 0.82, "aliked-n16": 0.7}
+"""Least cosine of a match by detector; XFeat's is that of its authors."""
+DEFAULT_MIN_COSINE = 0.8
+
+Matches = NDArray[np.intp]
+"""(m, 2) numbers of the keypoints in the first and in the second photo"""
+
+
+class Matcher(Protocol):
+    """Pairs the keypoints of two photos."""
+
+    def match(self, first: LocalFeatures, second: LocalFeatures) -> Matches:
+        """Return the pairs, best first; each keypoint is in at most one."""
+
+
+@dataclass(frozen=True, slots=True)
+class MutualNearest:
+    """Keypoints that are each other's nearest by cosine similarity, if it exceeds a minimum."""
+
+    min_cosine: float
+
+    @classmethod
+    def of_model(cls, model: str) -> MutualNearest:
+        """Return the matcher for the features of a `Detector.model`."""
+        return cls(MIN_COSINES.get(model.partition("@")[0], DEFAULT_MIN_COSINE))
+
+    def match(self, first: LocalFeatures, second: LocalFeatures) -> Matches:
+        """Return the mutual nearest pairs, most similar first."""
+        if not len(first.descriptors) or not len(second.descriptors):
+            return np.empty((0, 2), dtype=np.intp)
+        products = first.descriptors.astype(np.float32) @ second.descriptors.T.astype(np.float32)
+        nearest = products.argmax(axis=1)
+        numbers = np.arange(len(nearest))
+        is_mutual = products.argmax(axis=0)[nearest] == numbers
+        cosines = products[numbers, nearest] / QUANTISATION**2
+        chosen = np.flatnonzero(is_mutual & (cosines > self.min_cosine))
+        chosen = chosen[np.argsort(-cosines[chosen], kind="stable")]
+        return np.column_stack([chosen, nearest[chosen]])

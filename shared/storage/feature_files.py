@@ -1,0 +1,103 @@
+"""Feature files: the local features of a chunk's photos, row by row, beside the chunk.
+
+`<chunk>.features` is, in this order:
+
+    the bytes PWF1, and the length of the header as a little-endian uint32
+    the header, JSON: {"format": 1, "model": "xfeat@...", "rows": n}
+    n + 1 little-endian uint64: where each row begins, from the start of the file
+    the rows, each as `LocalFeatures.encode` writes it
+
+Row i has the features of the photo of row i of the chunk; it is empty where none were computed.
+Rows are read by range.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.storage import ObjectStore
+from shared.storage.chunks import read_up_to
+
+MAGIC = b"PWF1"
+MAX_HEADER_BYTES = 4096
+_START = struct.Struct("<4sI")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FeatureIndex:
+    """The start of a feature file."""
+
+    model: str
+    """`Detector.model`"""
+    offsets: NDArray[np.uint64]
+    """(n + 1,) where each row begins"""
+
+    @property
+    def rows(self) -> int:
+        return len(self.offsets) - 1
+
+
+def encode_feature_file(model: str, rows: Sequence[bytes]) -> bytes:
+    """Encode a feature file.
+
+    Args:
+        model: `Detector.model`.
+        rows: Encoded features by row; empty for photos without.
+    """
+    header = json.dumps({"format": 1, "model": model, "rows": len(rows)}).encode()
+    start = _START.pack(MAGIC, len(header)) + header
+    offsets = np.cumsum([len(start) + 8 * (len(rows) + 1), *map(len, rows)])
+    return b"".join([start, offsets.astype("<u8").tobytes(), *rows])
+
+
+def read_feature_index(store: ObjectStore, key: str) -> FeatureIndex:
+    """Read the start of a feature file.
+
+    Raises:
+        ValueError: The object is no feature file, or is damaged.
+        NotFound: The object is missing.
+    """
+    with store.open(key) as file:
+        start = read_up_to(file, _START.size)
+        magic, size = _START.unpack(start) if len(start) == _START.size else (b"", 0)
+        if magic != MAGIC or size > MAX_HEADER_BYTES:
+            raise ValueError(f"{key} is not a feature file")
+        try:
+            header = json.loads(read_up_to(file, size))
+            model, rows = str(header["model"]), int(header["rows"])
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"the header of {key} is damaged") from error
+        offsets = np.frombuffer(read_up_to(file, 8 * (rows + 1)), "<u8")
+    if len(offsets) != rows + 1 or (np.diff(offsets.astype(np.int64)) < 0).any():
+        raise ValueError(f"the offsets of {key} are damaged")
+    return FeatureIndex(model, offsets)
+
+
+def read_feature_rows(
+    store: ObjectStore, key: str, index: FeatureIndex, rows: Iterable[int]
+) -> dict[int, bytes]:
+    """Read single rows by range; rows without features, or beyond the end, are left out.
+
+    Raises:
+        ValueError: The file is truncated.
+        NotFound: The object is missing.
+    """
+    found = {}
+    with store.open(key) as file:
+        for row in sorted(set(rows)):
+            if row >= index.rows:
+                continue
+            begin, end = index.offsets[row : row + 2].tolist()
+            if begin == end:
+                continue
+            file.seek(begin)
+            found[row] = read_up_to(file, end - begin)
+            if len(found[row]) < end - begin:
+                raise ValueError(f"{key} is too short")
+    return found
