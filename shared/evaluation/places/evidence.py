@@ -59,6 +59,8 @@ class RankedPhoto:
     location: PhotoLocation
     photo: Hashable = None
     """identifies the photo in other rankings of the same map; None if it is not known"""
+    inliers: int | None = None
+    """verified matches of its local features with the query's; None if they were not compared"""
 
 
 def estimate_location(ranking: Sequence[RankedPhoto], radius_m: float) -> PhotoLocation:
