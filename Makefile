@@ -18,7 +18,7 @@ INSTALLED := $(VENV)/.installed
 INSTALL := VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-lab test-fast test-numerics test-deploy test-images test-browser test-api-fuzz pictures client api-page lint size types bench demo env clean
+.PHONY: help setup run test test-lab test-fast test-numerics test-deploy test-images test-browser test-api-fuzz pictures api-page lint size types bench demo env clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
@@ -73,9 +73,6 @@ test-api-fuzz: $(INSTALLED) ## many generated API calls (PLACEWISE_FUZZ_EXAMPLES
 
 pictures: $(INSTALLED) ## test-browser, and retake the screenshots in docs/pictures
 	PLACEWISE_TEST_BROWSER=1 PLACEWISE_PICTURES=docs/pictures $(BIN)/python -m pytest tests/browser
-
-client: $(INSTALLED) ## generate the synchronous client from the asynchronous one
-	$(BIN)/python -m tools.make_sync_client
 
 pages: $(INSTALLED) ## generate docs/api-calls.md and docs/reference.md
 	$(BIN)/python -m tools.make_api_page

@@ -1,11 +1,7 @@
-"""The asynchronous client with typed responses.
-
-`client.py` is generated from this file by `make client`. Edit this file.
-"""
+"""The asynchronous client with typed responses."""
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
@@ -314,7 +310,7 @@ class AsyncClient(AsyncTransport):
                     f"The job {job.job_id} is still {job.state} after {timeout_seconds:g} s.",
                 )
             if job.waiting_for:
-                await asyncio.sleep(1.0)  # the server does not hold long polls of such jobs
+                await self._sleep(1.0)  # the server does not hold long polls of such jobs
 
     async def wait(
         self,

@@ -1,7 +1,4 @@
-"""HTTP transport of the client: authentication, timeouts, retries, pagination and streaming.
-
-`transport.py` is generated from this file by `make client`. Edit this file.
-"""
+"""HTTP transport of the client: authentication, timeouts, retries, pagination and streaming."""
 
 from __future__ import annotations
 
@@ -60,7 +57,7 @@ class AsyncTransport:
         self.url = validate_url(url, key)
         self._patience = RetryPolicy(patience_seconds, on_wait)
         self._timeout_seconds = timeout_seconds
-        self._http = httpx2.AsyncClient(
+        self._open(
             base_url=self.url,
             timeout=timeout_seconds,
             params={"map": map_name} if map_name else None,
@@ -76,6 +73,35 @@ class AsyncTransport:
     async def aclose(self) -> None:
         """Close all connections."""
         await self._http.aclose()
+
+    # All that waits is in `aclose` and the next five methods, which the blocking client overrides.
+
+    def _open(self, **options: Any) -> None:
+        self._http = httpx2.AsyncClient(**options)
+
+    async def _sleep(self, seconds: float) -> None:
+        await asyncio.sleep(seconds)
+
+    async def _send(self, method: str, url: str, **options: Any) -> httpx2.Response:
+        return await self._http.request(method, url, **options)
+
+    async def _send_presigned(self, upload: Json, file: BinaryIO) -> httpx2.Response:
+        async with httpx2.AsyncClient(timeout=self._timeout_seconds) as http:
+            return await http.request(
+                upload["method"],
+                upload["url"],
+                content=_iter_chunks(file),
+                headers=upload["headers"],
+            )
+
+    async def _receive(self, url: str, write: Callable[[bytes], object]) -> httpx2.Response:
+        async with self._http.stream("GET", url) as response:
+            if response.is_success:
+                async for chunk in response.aiter_bytes(CHUNK_BYTES):
+                    write(chunk)
+            else:
+                await response.aread()
+        return response
 
     def with_patience(self, patience_seconds: float, on_wait: OnWait) -> Self:
         """Return a client that shares the connections and retries calls for another period.
@@ -110,7 +136,7 @@ class AsyncTransport:
             options["headers"] = {**options.get("headers", {}), **key}
 
         async def attempt() -> Any:
-            return (await self._request(self._http, method, f"{API}{path}", **options)).json()
+            return (await self._check(self._send(method, f"{API}{path}", **options))).json()
 
         return await self._retry(attempt)
 
@@ -118,7 +144,7 @@ class AsyncTransport:
         """GET a response that is not JSON."""
 
         async def attempt() -> bytes:
-            return (await self._request(self._http, "GET", f"{API}{path}")).content
+            return (await self._check(self._send("GET", f"{API}{path}"))).content
 
         return await self._retry(attempt)
 
@@ -141,21 +167,14 @@ class AsyncTransport:
     ) -> None:
         """Stream a response into a file, which is truncated before each attempt."""
 
+        def write(chunk: bytes) -> None:
+            file.write(chunk)
+            on_received(file.tell())
+
         async def attempt() -> None:
             file.seek(0)
             file.truncate()
-            received = 0
-            try:
-                async with self._http.stream("GET", f"{API}{path}") as response:
-                    if not response.is_success:
-                        await response.aread()
-                        raise response_error(response)
-                    async for chunk in response.aiter_bytes(CHUNK_BYTES):
-                        file.write(chunk)
-                        received += len(chunk)
-                        on_received(received)
-            except httpx2.TransportError as error:
-                raise self._unreachable("/", error) from error
+            await self._check(self._receive(f"{API}{path}", write))
 
         await self._retry(attempt)
 
@@ -164,35 +183,24 @@ class AsyncTransport:
 
         async def attempt() -> None:
             file.seek(0)
-            async with httpx2.AsyncClient(timeout=self._timeout_seconds) as http:
-                await self._request(
-                    http,
-                    upload["method"],
-                    upload["url"],
-                    content=_iter_chunks(file),
-                    headers=upload["headers"],
-                )
+            await self._check(self._send_presigned(upload, file))
 
         await self._retry(attempt)
 
-    async def _request(
-        self, http: httpx2.AsyncClient, method: str, url: str, **options: Any
-    ) -> httpx2.Response:
-        """Send one request; an error response is raised as the matching PlacewiseError."""
+    async def _check(self, sending: Awaitable[httpx2.Response]) -> httpx2.Response:
+        """Await a response; an error response is raised as the matching PlacewiseError."""
         try:
-            response = await http.request(method, url, **options)
+            response = await sending
         except httpx2.TransportError as error:
-            raise self._unreachable(url, error) from error
+            url = error.request.url  # a presigned one is not shown: it is a secret
+            host = self.url if str(url).startswith(self.url) else url.host
+            raise Unavailable(
+                "server_unreachable",
+                f"Can't reach Placewise at {host} ({type(error).__name__}). Check that it runs.",
+            ) from error
         if response.is_success:
             return response
         raise response_error(response)
-
-    def _unreachable(self, url: str, error: httpx2.TransportError) -> Unavailable:
-        host = self.url if url.startswith("/") else httpx2.URL(url).host
-        return Unavailable(
-            "server_unreachable",
-            f"Can't reach Placewise at {host} ({type(error).__name__}). Check that it runs.",
-        )
 
     async def _retry(self, call: Callable[[], Awaitable[Answer]]) -> Answer:
         deadline = time.monotonic() + self._patience.seconds
@@ -202,7 +210,7 @@ class AsyncTransport:
                 return await call()
             except (Unavailable, TooManyRequests, Conflict) as error:
                 is_late = time.monotonic() >= deadline
-                await asyncio.sleep(self._patience.wait_seconds(error, attempt, is_late))
+                await self._sleep(self._patience.wait_seconds(error, attempt, is_late))
                 attempt += 1
 
 

@@ -1,575 +1,191 @@
-"""The client with typed responses.
+"""The client for code without asyncio: it runs the calls of AsyncClient without an event loop.
 
-Generated from `async_client.py` by `make client`. Edit that file.
+Its requests and waits block, so the coroutine of a call never suspends, and one step runs it to its
+end, in the thread of the caller.
 """
 
 from __future__ import annotations
 
-import contextlib
+import copy
+import functools
 import time
-from collections.abc import Callable, Iterator, Sequence
-from datetime import datetime
-from pathlib import Path
-from typing import Any, BinaryIO, Literal
-from urllib.parse import quote
-from uuid import UUID
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from typing import Any, BinaryIO, Concatenate, ParamSpec, Self, TypeVar, cast
 
-from placewise import answers
-from placewise.protocol import (
-    API,
-    POLL_SECONDS,
-    Json,
-    ReadProgressFile,
-    drop_none,
-    open_file,
-    printable_name,
-    size_and_sha256,
-    to_jsonl,
-)
-from placewise.transport import Transport
-from shared.errors import Unavailable, Unprocessable
+import httpx2
 
-HEADER_BYTES = 256 * 1024
-Id = UUID | str
-Work = answers.Uploaded | answers.Started | answers.Job | UUID | str
-"""A job: the response that started it, the job itself, or its ID."""
+from placewise.async_client import AsyncClient, Work
+from placewise.protocol import CHUNK_BYTES, TIMEOUT_SECONDS, Json, OnWait
+
+__all__ = ["Client", "Work"]
+
+P = ParamSpec("P")
+Answer = TypeVar("Answer")
 
 
-class Client(Transport):
-    """Client of one server and one map."""
+class _BlockingCalls(AsyncClient):
+    """Calls whose coroutines never suspend."""
 
-    def upload(
-        self, photo: str | Path | BinaryIO, filename: str | None = None, **fields: Any
-    ) -> answers.Uploaded:
-        """Upload a photo, streamed from its file.
+    def _open(self, **options: Any) -> None:
+        self._blocking_http = httpx2.Client(**options)
 
-        Args:
-            photo: The file: its path, or open for reading bytes, such as io.BytesIO.
-            filename: Name to store; None for the name of the path.
-            fields: Form fields: `latitude` and `longitude` (degrees), `heading`, `captured_at`,
-                `place`, `tags`, `metadata`, `role`, `relative_path`.
+    async def _sleep(self, seconds: float) -> None:
+        time.sleep(seconds)
 
-        Raises:
-            Conflict: `photo_differs` if the map contains the same image with other metadata.
-            UnsupportedMedia: The file is not a supported image.
-            TooLarge: The file exceeds the server's limit.
-            Unprocessable: A field or the image is invalid.
-        """
-        data = {name: str(value) for name, value in drop_none(**fields).items()}
-        file = Path(photo) if isinstance(photo, (str, Path)) else photo
-        return answers.Uploaded(**self._send_file("/upload", file, filename, data=data))
+    async def _send(self, method: str, url: str, **options: Any) -> httpx2.Response:
+        return self._blocking_http.request(method, url, **options)
 
-    def upload_direct(
-        self, photo: str | Path, filename: str | None = None, **fields: Any
-    ) -> answers.Uploaded:
-        """Upload a photo directly to the server's bucket with a presigned URL.
+    async def _send_presigned(self, upload: Json, file: BinaryIO) -> httpx2.Response:
+        with httpx2.Client(timeout=self._timeout_seconds) as http:
+            return http.request(
+                upload["method"], upload["url"], content=file, headers=upload["headers"]
+            )
 
-        The arguments are those of `upload`; `fields` are JSON values.
+    async def _receive(self, url: str, write: Callable[[bytes], object]) -> httpx2.Response:
+        with self._blocking_http.stream("GET", url) as response:
+            if response.is_success:
+                for chunk in response.iter_bytes(CHUNK_BYTES):
+                    write(chunk)
+            else:
+                response.read()
+        return response
 
-        Raises:
-            Conflict: `no_direct_uploads` if the server stores photos in a folder.
-        """
-        with open_file(Path(photo)) as file:
-            size, sha256 = size_and_sha256(file)
-            body = {
-                "filename": filename or printable_name(Path(photo)),
-                "file_size": size,
-                "sha256": sha256,
-                **drop_none(**fields),
-            }
-            presigned = self._call("POST", "/uploads/presign", json=body)
-            self._put_presigned(presigned, file)
-        complete_path = presigned["complete_url"].removeprefix(API)
-        return answers.Uploaded(**self._call("POST", complete_path))
+    async def aclose(self) -> None:
+        self._blocking_http.close()
 
-    def upload_files(
-        self, photos: Sequence[str | Path], manifest: Sequence[Json] = ()
-    ) -> answers.BatchStarted:
-        """Start a batch upload of photo files.
 
-        Each manifest entry contains a `filename` and fields of `upload`.
-        """
-        with contextlib.ExitStack() as stack:
-            files: list[tuple[str, Any]] = [
-                ("file", (printable_name(Path(photo)), stack.enter_context(open_file(Path(photo)))))
-                for photo in photos
-            ]
-            if manifest:
-                files.append(("manifest", ("manifest.jsonl", to_jsonl(manifest))))
-            return self._start_batch(files=files)
+def _run(call: Awaitable[Answer]) -> Answer:
+    try:
+        next(call.__await__())
+    except StopIteration as end:
+        return cast("Answer", end.value)
+    raise RuntimeError("a call of the blocking client has suspended")
 
-    def import_objects(self, manifest: Sequence[Json] | bytes) -> answers.BatchStarted:
-        """Start a batch import of objects in the server's store.
 
-        Each manifest entry contains an object `key` and fields of `upload`; bytes are JSONL.
-        """
-        body = manifest if isinstance(manifest, bytes) else to_jsonl(manifest)
-        headers = {"Content-Type": "application/x-ndjson"}
-        return self._start_batch(content=body, headers=headers)
+def _iterate(items: AsyncIterator[Answer]) -> Iterator[Answer]:
+    while True:
+        try:
+            item = _run(anext(items))
+        except StopAsyncIteration:
+            return
+        yield item
 
-    def import_prefix(self, prefix: str) -> answers.BatchStarted:
-        """Start a batch import of all photos in the server's store below a key prefix."""
-        return self._start_batch(files={"prefix": (None, prefix)})
 
-    def _start_batch(self, **body: Any) -> answers.BatchStarted:
-        return answers.BatchStarted(**self._call("POST", "/upload/batch", **body))
+def _blocking(
+    method: Callable[Concatenate[AsyncClient, P], Awaitable[Answer]],
+) -> Callable[Concatenate[Client, P], Answer]:
+    @functools.wraps(method)
+    def call(client: Client, *args: P.args, **kwargs: P.kwargs) -> Answer:
+        return _run(method(client._calls, *args, **kwargs))
 
-    def batch_items(self, work: Work, *states: str) -> Iterator[answers.BatchItem]:
-        """Iterate over the items of a batch, optionally only those in the given states."""
-        path = f"/jobs/{_job_id(work)}/items"
-        return self._iterate(answers.BatchItem, path, "items", state=list(states) or None)
+    return call
 
-    def similar(
+
+def _iterating(
+    method: Callable[Concatenate[AsyncClient, P], AsyncIterator[Answer]],
+) -> Callable[Concatenate[Client, P], Iterator[Answer]]:
+    @functools.wraps(method)
+    def call(client: Client, *args: P.args, **kwargs: P.kwargs) -> Iterator[Answer]:
+        return _iterate(method(client._calls, *args, **kwargs))
+
+    return call
+
+
+class Client:
+    """Client of one server and one map; close it, or use it as a context manager."""
+
+    def __init__(
         self,
-        photo: str | Path | answers.Photo | UUID,
-        top_k: int = 10,
-        min_score: float | None = None,
-        rerank: int | None = None,
-        explain: bool = False,
-        wait_seconds: int = 60,
-        **filters: Any,
-    ) -> answers.Similar:
-        """Find the most similar photos and estimate the place.
-
-        Args:
-            photo: A file, which is not stored, or a stored photo (a Photo or its UUID).
-            top_k: Maximum number of results.
-            min_score: Minimum cosine similarity.
-            rerank: Number of first results to rerank by comparing patches.
-            explain: Add explanations to the results.
-            wait_seconds: How long the server may hold the call (`Prefer: wait`) before the client
-                polls the job instead.
-            filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
-                `captured_before`, `place`, `place_under`, `tags`, `tags_like` and `ids`
-                (comma-separated);
-                `word_weights=False` ranks by the unweighted cosine similarity; `certainty` is the
-                share of answers that must be right; `history=False` leaves the search out of the
-                search history.
-        """
-        options: Json = {
-            "params": drop_none(
-                top_k=top_k,
-                min_score=min_score,
-                rerank=rerank,
-                explain=explain or None,
-                **filters,
-            ),
-            "headers": {"Prefer": f"wait={wait_seconds}"},
-        }
-        if isinstance(photo, (answers.Photo, UUID)):
-            file_id = photo.image_id if isinstance(photo, answers.Photo) else photo
-            answer = self._call("POST", f"/similarity/{file_id}", **options)
-        else:
-            answer = self._send_file("/similarity", Path(photo), **options)
-        while "result_url" in answer:  # one job may lead to another
-            for _ in self.watch(answer["job_id"]):
-                pass
-            answer = self._call("GET", answer["result_url"].removeprefix(API))
-        return answers.Similar(**answer)
-
-    def read_header(self, photo: str | Path) -> answers.PhotoHeader:
-        """Read when, where and by which camera a photo was taken from the begin of its file.
-
-        Raises:
-            Unprocessable: `undecodable_photo`.
-        """
-        with open_file(Path(photo)) as file:
-            begin = file.read(HEADER_BYTES)
-        headers = {"Content-Type": "application/octet-stream"}
-        return answers.PhotoHeader(
-            **self._call("POST", "/photo-headers", content=begin, headers=headers)
-        )
-
-    def propose_positions(
-        self, photos: Sequence[Json], track: Sequence[Json] = (), **options: Any
-    ) -> list[answers.Proposal]:
-        """Propose where photos were taken that have no coordinates. Nothing is stored.
-
-        Args:
-            photos: The photos of a folder, with and without coordinates: `name`, and the fields of
-                `read_header` as JSON; those without coordinates may have what `similar` answered,
-                as `search` with `similar`, `circles` and `not_in_map`.
-            track: Points of a GPX track: `time`, `latitude`, `longitude`.
-            options: `radius_m`, `motion` (`walk`, `bicycle`, `car`, `train`), `together`.
-
-        Returns:
-            The proposals for the photos without coordinates, in their order.
-        """
-        body = {"photos": list(photos), "track": list(track), **options}
-        answer = self._call("POST", "/positions", json=body)
-        return [answers.Proposal(**each) for each in answer["proposals"]]
-
-    def begin_track(
-        self, *, motion: str | None = None, max_speed_mps: float | None = None, **start: Any
-    ) -> answers.Track:
-        """Begin a track: a sequence of frames that is followed through the map.
-
-        Args:
-            motion: How the camera moves: `walk`, `bicycle`, `car` (the default) or `train`.
-            max_speed_mps: Its maximum speed in m/s, instead of `motion`.
-            start: Where the track begins, if known: `latitude`, `longitude` (degrees) and
-                `accuracy_m`; or `place`.
-        """
-        body = drop_none(motion=motion, max_speed_mps=max_speed_mps, **start)
-        return answers.Track(**self._call("POST", "/tracks", json=body))
-
-    def add_frame(
-        self,
-        track_id: Id,
-        photo: str | Path,
-        captured_at: datetime,
+        url: str,
+        map_name: str | None = None,
+        key: str | None = None,
         *,
-        wait: bool = True,
-        expected_version: int | None = None,
-        **measured: float | None,
-    ) -> answers.TrackFrame:
-        """Add a frame to a track. The photo is not stored in the map.
-
-        Args:
-            track_id: The track.
-            photo: The file.
-            captured_at: When it was taken; unique in the track.
-            wait: Wait for the state; False returns as soon as the frame is stored.
-            expected_version: Version that the track must have, such as `version` of the frame
-                before.
-            measured: `latitude`, `longitude` (degrees) and `accuracy_m` of a position;
-                `distance_m` and `distance_accuracy_m`, also `turn_degrees` and
-                `turn_accuracy_degrees`, of odometry since the frame before.
-
-        Raises:
-            Conflict: `track_changed`, `frame_differs`, `frame_too_late` or `track_full`.
-            Unprocessable: A field or the image is invalid.
-        """
-        fields = drop_none(
-            captured_at=captured_at.isoformat(), expected_version=expected_version, **measured
-        )
-        answer = self._send_file(
-            f"/tracks/{track_id}/frames",
-            Path(photo),
-            data={name: str(value) for name, value in fields.items()},
-            headers={"Prefer": f"wait={POLL_SECONDS:g}"} if wait else {},
-        )
-        frame = answers.TrackFrame(**answer)
-        while wait and frame.status == "pending":
-            frame = self.track_frame(track_id, frame.frame_id, wait_seconds=POLL_SECONDS)
-        return frame
-
-    def track_frame(
-        self, track_id: Id, frame_id: Id, *, wait_seconds: float = 0
-    ) -> answers.TrackFrame:
-        """Get a frame of a track; with `wait_seconds`, wait that long until it is applied."""
-        path = f"/tracks/{track_id}/frames/{frame_id}"
-        headers = {"Prefer": f"wait={wait_seconds:.0f}"}
-        return answers.TrackFrame(**self._call("GET", path, headers=headers))
-
-    def track(self, track_id: Id, *, smoothed: bool = False) -> answers.OneTrack:
-        """Get a track with all frames; `smoothed` uses the later frames for each state, too."""
-        params = drop_none(smoothed=smoothed or None)
-        return answers.OneTrack(**self._call("GET", f"/tracks/{track_id}", params=params))
-
-    def tracks(self) -> Iterator[answers.Track]:
-        """Iterate over the tracks of the map, newest first."""
-        return self._iterate(answers.Track, "/tracks", "tracks")
-
-    def delete_track(self, track_id: Id) -> answers.DeletedTrack:
-        """Delete a track with its frames."""
-        return answers.DeletedTrack(**self._call("DELETE", f"/tracks/{track_id}"))
-
-    def job(self, work: Work, wait_seconds: float = 0) -> answers.Job:
-        """Get a job; with `wait_seconds`, wait that long for it to end (long polling)."""
-        path = f"/jobs/{_job_id(work)}"
-        return answers.Job(**self._call("GET", path, params={"wait": wait_seconds}))
-
-    def jobs(self, **filters: Any) -> Iterator[answers.Job]:
-        """Iterate over the map's jobs, newest first; filters are `state` and `kind`."""
-        return self._iterate(answers.Job, "/jobs", "jobs", **filters)
-
-    def watch(
-        self,
-        work: Work,
-        timeout_seconds: float | None = None,
-        poll_seconds: float = POLL_SECONDS,
-    ) -> Iterator[answers.Job]:
-        """Poll a job and iterate over its states; the last one is its end, also if it failed.
-
-        Args:
-            work: The job.
-            timeout_seconds: Maximum time to wait; None for no limit.
-            poll_seconds: Maximum duration of a poll, which ends early when the job ends.
-
-        Raises:
-            Unavailable: `job_unfinished` if the timeout expires.
-        """
-        deadline = None if timeout_seconds is None else time.monotonic() + timeout_seconds
-        while True:
-            remaining = poll_seconds if deadline is None else deadline - time.monotonic()
-            job = self.job(work, max(0.0, min(remaining, poll_seconds)))
-            yield job
-            if job.finished:
-                return
-            if deadline is not None and time.monotonic() >= deadline:
-                raise Unavailable(
-                    "job_unfinished",
-                    f"The job {job.job_id} is still {job.state} after {timeout_seconds:g} s.",
-                )
-            if job.waiting_for:
-                time.sleep(1.0)  # the server does not hold long polls of such jobs
-
-    def wait(
-        self,
-        work: Work,
-        timeout_seconds: float | None = None,
-        on_progress: Callable[[answers.Job], object] = lambda job: None,
-        poll_seconds: float = POLL_SECONDS,
-    ) -> answers.Job:
-        """Wait until a job succeeds.
-
-        Args:
-            work: The job.
-            timeout_seconds: Maximum time to wait; None for no limit.
-            on_progress: Called with the job after every poll.
-            poll_seconds: Maximum duration of a poll, which ends early when the job ends.
-
-        Raises:
-            Unprocessable: The job failed (with the job's `code`) or was cancelled (`job_ended`).
-            Unavailable: `job_unfinished` if the timeout expires.
-        """
-        for job in self.watch(work, timeout_seconds, poll_seconds):
-            on_progress(job)
-        job.raise_for_failure()
-        return job
-
-    def cancel(self, work: Work) -> answers.Job:
-        """Cancel a job."""
-        return answers.Job(**self._call("POST", f"/jobs/{_job_id(work)}/cancel"))
-
-    def retry(self, work: Work) -> answers.Job:
-        """Queue a failed or cancelled job again.
-
-        For a batch: its failed and cancelled items whose bytes are still stored.
-        """
-        return answers.Job(**self._call("POST", f"/jobs/{_job_id(work)}/retry"))
-
-    def photo(self, file_id: Id) -> answers.OnePhoto:
-        """Get a stored photo's metadata and state."""
-        return answers.OnePhoto(**self._call("GET", f"/uploads/{file_id}"))
-
-    def image(self, file_id: Id) -> bytes:
-        """Download the original bytes of a photo."""
-        return self._get_bytes(f"/uploads/{file_id}/image")
-
-    def photos(self, **filters: Any) -> Iterator[answers.Photo]:
-        """Iterate over photos by metadata, newest first; for filters see `GET /search`."""
-        return self._iterate(answers.Photo, "/search", "images", **filters)
-
-    def patch_photo(self, file_id: Id, **fields: Any) -> answers.OnePhoto:
-        """Update a photo's metadata: omitted fields are unchanged, None clears a field."""
-        return answers.OnePhoto(**self._call("PATCH", f"/uploads/{file_id}", json=fields))
-
-    def delete_photo(self, file_id: Id) -> answers.Deleted:
-        """Delete a photo."""
-        return answers.Deleted(**self._call("DELETE", f"/uploads/{file_id}"))
-
-    def fit_vocabulary(self, **options: int) -> answers.Started:
-        """Start fitting a vocabulary on the map's photos.
-
-        Options are `clusters`, `sample` and `seed`.
-        """
-        return answers.Started(**self._call("POST", "/vocabularies", json=options))
-
-    def import_vocabulary(self, file: str | Path) -> answers.Started:
-        """Start reindexing the map with a vocabulary from a `.npz` or `.npy` file."""
-        return answers.Started(**self._send_file("/vocabularies/import", Path(file)))
-
-    def vocabularies(self) -> list[answers.Vocabulary]:
-        """List the map's vocabularies, newest first."""
-        return [answers.Vocabulary(**item) for item in self._call("GET", "/vocabularies")]
-
-    def vocabulary_file(self, vocabulary_id: Id) -> bytes:
-        """Download a vocabulary file that `import_vocabulary` accepts.
-
-        The format is `.npz` (starting with `PK`), or `.npy` if its provenance is unknown.
-        """
-        return self._get_bytes(f"/vocabularies/{vocabulary_id}/file")
-
-    def start_generation(
-        self,
-        *,
-        vocabulary_id: Id | None = None,
-        pca: int | None = None,
-        extractor: str | None = None,
-    ) -> answers.Started:
-        """Start a new generation of the map's descriptors.
-
-        Without arguments, PCA is undone for an extractor without a vocabulary.
-
-        Args:
-            vocabulary_id: One of the map's vocabularies.
-            pca: Number of dimensions to reduce to by PCA whitening.
-            extractor: Another extractor.
-        """
-        body = drop_none(
-            vocabulary_id=vocabulary_id and str(vocabulary_id), pca=pca, extractor=extractor
-        )
-        return answers.Started(**self._call("POST", "/generations", json=body))
-
-    def generations(self) -> list[answers.Generation]:
-        """List the map's generations, newest first."""
-        return [answers.Generation(**item) for item in self._call("GET", "/generations")]
-
-    def export_descriptors(
-        self,
-        generation_id: Id,
-        file: BinaryIO,
-        on_received: Callable[[int], object] = lambda received_bytes: None,
+        patience_seconds: float = 0.0,
+        on_wait: OnWait = lambda error, seconds: None,
+        timeout_seconds: float = TIMEOUT_SECONDS,
     ) -> None:
-        """Download a tar with `descriptors.npy`, `names.txt` and `photos.csv` into a file.
+        """Create a client; `placewise.connect` explains the arguments.
 
         Args:
-            generation_id: A generation of the map.
-            file: Seekable and writable; overwritten from its beginning.
-            on_received: Called with the number of bytes received so far.
+            on_wait: Called before each retry with the error and the seconds until then.
         """
-        path = f"/generations/{generation_id}/descriptors"
-        self._download(path, file, on_received)
-
-    def learn_word_weights(self, generation_id: Id, **options: int) -> answers.Started:
-        """Start fitting word weights of the active generation; options are `sample` and `seed`."""
-        path = f"/generations/{generation_id}/word-weights"
-        return answers.Started(**self._call("POST", path, json=options))
-
-    def word_weights(self, generation_id: Id) -> answers.WordWeights:
-        """Get the word weights that were fitted for a generation."""
-        path = f"/generations/{generation_id}/word-weights"
-        return answers.WordWeights(**self._call("GET", path))
-
-    def evaluate(self, **options: int) -> answers.Started:
-        """Start an evaluation of the map; options are `sample` and `seed`."""
-        return answers.Started(**self._call("POST", "/evaluations", json=options))
-
-    def evaluations(self) -> Iterator[answers.Evaluation]:
-        """Iterate over the map's evaluations, newest first."""
-        return self._iterate(answers.Evaluation, "/evaluations", "evaluations")
-
-    def searches(self) -> Iterator[answers.Search]:
-        """Iterate over the search history, newest first."""
-        return self._iterate(answers.Search, "/searches", "searches")
-
-    def maps(self) -> list[answers.Map]:
-        """List the maps of the server."""
-        return [answers.Map(**item) for item in self._call("GET", "/maps")]
-
-    def create_map(
-        self,
-        name: str,
-        extractor: str | None = None,
-        *,
-        place_labels_are_paths: bool | None = None,
-        rows: str | None = None,
-        auto_fit: bool = True,
-    ) -> answers.Map:
-        """Create a map; `extractor` and `rows` (float32 or float16) default to the settings.
-
-        With `place_labels_are_paths`, `/` separates the levels of place labels, or not; by default,
-        evaluations decide that by the labels.
-        """
-        body = drop_none(
-            name=name,
-            extractor=extractor,
-            place_labels_are_paths=place_labels_are_paths,
-            rows=rows,
-            auto_fit=None if auto_fit else False,
+        self._calls: AsyncClient = _BlockingCalls(
+            url,
+            map_name,
+            key,
+            patience_seconds=patience_seconds,
+            on_wait=on_wait,
+            timeout_seconds=timeout_seconds,
         )
-        return answers.Map(**self._call("POST", "/maps", json=body))
+        self.url = self._calls.url
 
-    def update_map(
-        self,
-        name: str,
-        *,
-        place_labels_are_paths: bool | Literal["auto"] | None = None,
-        rows: str | None = None,
-        auto_fit: bool | None = None,
-    ) -> answers.Map:
-        """Change settings of a map; None leaves one unchanged.
+    def __enter__(self) -> Self:
+        return self
 
-        Args:
-            place_labels_are_paths: Whether `/` separates the levels of place labels. With `auto`,
-                the labels decide, now and at each evaluation.
-            rows: float32 or float16, for generations that are created from then on.
-            auto_fit: Whether vocabularies are fitted automatically.
-        """
-        body = drop_none(
-            place_labels_are_paths=place_labels_are_paths, rows=rows, auto_fit=auto_fit
-        )
-        return answers.Map(**self._call("PATCH", f"/maps/{quote(name, safe='')}", json=body))
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
-    def delete_map(self, name: str) -> answers.DeletedMap:
-        """Delete a map and all its photos."""
-        return answers.DeletedMap(**self._call("DELETE", f"/maps/{quote(name, safe='')}"))
+    def close(self) -> None:
+        """Close all connections."""
+        _run(self._calls.aclose())
 
-    def stats(self) -> answers.Stats:
-        """Get statistics of the map."""
-        return answers.Stats(**self._call("GET", "/database/stats"))
-
-    def add_model(
-        self,
-        checkpoint: str | Path,
-        name: str,
-        *,
-        licence: str | None = None,
-        note: str | None = None,
-        on_sent: Callable[[int], object] = lambda sent_bytes: None,
-    ) -> answers.Started:
-        """Start adding a checkpoint of `placewise train` as an extractor.
+    def with_patience(self, patience_seconds: float, on_wait: OnWait) -> Self:
+        """Return a client that shares the connections and retries calls for another period.
 
         Args:
-            checkpoint: The file.
-            name: Permanent name; maps refer to it as `gsv:NAME`.
-            licence: Licence of the weights.
-            note: Free text.
-            on_sent: Called with the number of bytes sent so far.
+            patience_seconds: How long calls are retried; see `connect`.
+            on_wait: Called before each wait with the error and the number of seconds.
         """
-        data = drop_none(name=name, licence=licence, note=note)
-        with open_file(Path(checkpoint)) as file:
-            files = {"file": (printable_name(Path(checkpoint)), ReadProgressFile(file, on_sent))}
-            return answers.Started(**self._call("POST", "/models", files=files, data=data))
+        other = copy.copy(self)
+        other._calls = self._calls.with_patience(patience_seconds, on_wait)
+        return other
 
-    def models(self) -> list[answers.AddedModel]:
-        """List the added models."""
-        page = self._call("GET", "/models")
-        return [answers.AddedModel(**item) for item in page["models"]]
-
-    def remove_model(self, name: str) -> answers.RemovedModel:
-        """Remove a model that no map uses."""
-        path = f"/models/{quote(name, safe='')}"
-        return answers.RemovedModel(**self._call("DELETE", path))
-
-    def keys(self) -> list[answers.Key]:
-        """List the API keys of the server, without their secrets (admin only)."""
-        return [answers.Key(**item) for item in self._call("GET", "/keys")]
-
-    def create_key(self, name: str, scopes: Sequence[str], **limits: Any) -> answers.CreatedKey:
-        """Create an API key (admin only). Its secret is shown only in this response.
-
-        Args:
-            name: Owner or purpose.
-            scopes: `read`, `write`, `admin`.
-            limits: The optional fields of `POST /keys`: `maps`, `days`, `requests_per_minute`,
-                `upload_bytes_per_day`, `max_photos`.
-        """
-        body = {"name": name, "scopes": list(scopes), **drop_none(**limits)}
-        return answers.CreatedKey(**self._call("POST", "/keys", json=body))
-
-    def revoke_key(self, key_id: Id) -> answers.Key:
-        """Revoke an API key (admin only)."""
-        return answers.Key(**self._call("DELETE", f"/keys/{key_id}"))
-
-
-def _job_id(work: Work) -> Id:
-    if isinstance(work, (UUID, str)):
-        return work
-    if work.job_id is None:
-        raise Unprocessable(
-            "no_job", "This upload has no job: its photo has already been described."
-        )
-    return work.job_id
+    upload = _blocking(AsyncClient.upload)
+    upload_direct = _blocking(AsyncClient.upload_direct)
+    upload_files = _blocking(AsyncClient.upload_files)
+    import_objects = _blocking(AsyncClient.import_objects)
+    import_prefix = _blocking(AsyncClient.import_prefix)
+    batch_items = _iterating(AsyncClient.batch_items)
+    similar = _blocking(AsyncClient.similar)
+    read_header = _blocking(AsyncClient.read_header)
+    propose_positions = _blocking(AsyncClient.propose_positions)
+    begin_track = _blocking(AsyncClient.begin_track)
+    add_frame = _blocking(AsyncClient.add_frame)
+    track_frame = _blocking(AsyncClient.track_frame)
+    track = _blocking(AsyncClient.track)
+    tracks = _iterating(AsyncClient.tracks)
+    delete_track = _blocking(AsyncClient.delete_track)
+    job = _blocking(AsyncClient.job)
+    jobs = _iterating(AsyncClient.jobs)
+    watch = _iterating(AsyncClient.watch)
+    wait = _blocking(AsyncClient.wait)
+    cancel = _blocking(AsyncClient.cancel)
+    retry = _blocking(AsyncClient.retry)
+    photo = _blocking(AsyncClient.photo)
+    image = _blocking(AsyncClient.image)
+    photos = _iterating(AsyncClient.photos)
+    patch_photo = _blocking(AsyncClient.patch_photo)
+    delete_photo = _blocking(AsyncClient.delete_photo)
+    fit_vocabulary = _blocking(AsyncClient.fit_vocabulary)
+    import_vocabulary = _blocking(AsyncClient.import_vocabulary)
+    vocabularies = _blocking(AsyncClient.vocabularies)
+    vocabulary_file = _blocking(AsyncClient.vocabulary_file)
+    start_generation = _blocking(AsyncClient.start_generation)
+    generations = _blocking(AsyncClient.generations)
+    export_descriptors = _blocking(AsyncClient.export_descriptors)
+    learn_word_weights = _blocking(AsyncClient.learn_word_weights)
+    word_weights = _blocking(AsyncClient.word_weights)
+    evaluate = _blocking(AsyncClient.evaluate)
+    evaluations = _iterating(AsyncClient.evaluations)
+    searches = _iterating(AsyncClient.searches)
+    maps = _blocking(AsyncClient.maps)
+    create_map = _blocking(AsyncClient.create_map)
+    update_map = _blocking(AsyncClient.update_map)
+    delete_map = _blocking(AsyncClient.delete_map)
+    stats = _blocking(AsyncClient.stats)
+    add_model = _blocking(AsyncClient.add_model)
+    models = _blocking(AsyncClient.models)
+    remove_model = _blocking(AsyncClient.remove_model)
+    keys = _blocking(AsyncClient.keys)
+    create_key = _blocking(AsyncClient.create_key)
+    revoke_key = _blocking(AsyncClient.revoke_key)

@@ -153,7 +153,8 @@ def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
     # The client's alone: threads that other tests have left go by the real one.
     own = SimpleNamespace(sleep=sleep, monotonic=lambda: clock[0])
-    monkeypatch.setattr("placewise.transport.time", own)
+    monkeypatch.setattr("placewise.async_transport.time", own)
+    monkeypatch.setattr("placewise.client.time", own)
     monkeypatch.setattr("placewise.protocol.random", SimpleNamespace(uniform=lambda low, _: low))
     return waits
 
