@@ -8,11 +8,9 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from uuid import UUID
 
-from shared.catalog.database.schema import migrate, wait_for_schema
+from shared.catalog.database.schema import wait_for_schema
 from shared.catalog.database.session import Catalog
-from shared.catalog.installation import get_or_create_installation
 from shared.catalog.tables import open_catalog
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
@@ -49,15 +47,6 @@ def service_process(settings: Settings, name: str) -> Iterator[Catalog]:
     ):
         wait_for_schema(catalog, SCHEMA_WAIT_SECONDS)
         yield catalog
-
-
-def migrate_catalog(settings: Settings) -> UUID:
-    """Migrate the catalog's schema to this release; returns the id of the installation."""
-    configure_logging(settings, "migrate", to_file=False)
-    with contextlib.closing(open_catalog(settings, "migrate")) as catalog:
-        migrate(catalog)
-        with catalog.write() as session:
-            return get_or_create_installation(session).id
 
 
 @contextlib.contextmanager

@@ -64,8 +64,6 @@ LAB_COMMANDS = {
     "datasets": "lab.cli.datasets.commands:app",
     "bench": "lab.cli.bench:app",
 }
-# Subcommands of a group that are accepted without it: they are typed in a hurry.
-SHORT_COMMANDS = {"verify": "storage", "backup": "storage", "restore": "storage"}
 ROOT = Path(__file__).parents[2]
 
 
@@ -157,8 +155,6 @@ def run() -> None:
     logging.basicConfig(
         level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
     )
-    if sys.argv[1:] and sys.argv[1] in SHORT_COMMANDS:
-        sys.argv.insert(1, SHORT_COMMANDS[sys.argv[1]])
     names = sys.argv[1:2]
     if sys.argv[1:] in ([], ["--help"], ["--version"]):
         app = _build_overview()

@@ -98,7 +98,7 @@ def check_not_behind(catalog: Catalog, store: ObjectStore) -> list[Segment]:
         raise Misconfigured(
             "rebuild_unfinished",
             "The rebuild of the catalog was interrupted. Run the same command again (`placewise "
-            "storage rebuild`, or `placewise restore`).",
+            "storage rebuild`, or `placewise storage restore`).",
         )
     later = [segment for segment in segments if segment.last > sequence]
     if later:

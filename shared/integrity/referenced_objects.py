@@ -1,6 +1,6 @@
 """Lists the objects that the catalog's rows reference, with their expected size and hash.
 
-Backups must contain these objects, and `placewise verify` checks them.
+Backups must contain these objects, and `placewise storage verify` checks them.
 """
 
 from __future__ import annotations

@@ -196,7 +196,7 @@ def chunk_corrupt_error(object_key: str) -> Unavailable:
     return Unavailable(
         CORRUPT,
         f"The chunk {object_key} is damaged (its hash differs). "
-        "Restore the object from a backup, or describe its photos again: placewise verify "
+        "Restore the object from a backup, or describe its photos again: placewise storage verify "
         "--repair.",
         object_key=object_key,
     )

@@ -21,9 +21,9 @@ from shared.storage.protocol import OwnedStore
 log = logging.getLogger(__name__)
 
 RECOVERY_ADVICE = (
-    "Restore the catalog (the file itself, or `placewise restore` into an empty one) or correct "
-    "DATABASE_URL; rebuild the catalog from the objects: placewise storage rebuild; or make this "
-    "catalog, which does not know those objects, the owner: placewise storage adopt."
+    "Restore the catalog (the file itself, or `placewise storage restore` into an empty one) or "
+    "correct DATABASE_URL; rebuild the catalog from the objects: placewise storage rebuild; or "
+    "make this catalog, which does not know those objects, the owner: placewise storage adopt."
 )
 
 
@@ -125,7 +125,9 @@ def store_taken_error(store: OwnedStore, reason: str) -> Misconfigured:
 def _check_unmarked(store: OwnedStore, sample: Collection[str]) -> None:
     """Reject a store without a mark, unless it is empty or has the sample of referenced keys."""
     present = sum(store.head(key) is not None for key in sample)
-    if sample and 2 * present >= len(sample):  # `placewise verify` reports single lost objects
+    if sample and 2 * present >= len(
+        sample
+    ):  # `placewise storage verify` reports single lost objects
         log.info(
             "%s has the catalog's objects and is now marked as owned by it", _display_name(store)
         )
@@ -137,7 +139,7 @@ def _check_unmarked(store: OwnedStore, sample: Collection[str]) -> None:
             "object_store_changed",
             f"{_display_name(store)} is empty, but the catalog references photos or models. "
             "Is the disk mounted? Otherwise correct PLACEWISE_HOME or S3_BUCKET, or restore the "
-            "objects from a backup (placewise restore).",
+            "objects from a backup (placewise storage restore).",
         )
 
 

@@ -112,9 +112,9 @@ class Hold:
         return (
             f"No row of the catalog references {self.orphans} of {self.objects} objects "
             f"({self.orphan_bytes / 1e6:.1f} MB), and {why}: nothing was collected. If this is "
-            "the wrong catalog, restore the right one, or run `placewise verify --repair`. If the "
-            "objects are garbage, `placewise storage collect` lists them, and with --confirm it "
-            "moves them to the trash."
+            "the wrong catalog, restore the right one, or run `placewise storage verify --repair`. "
+            "If the objects are garbage, `placewise storage collect` lists them, and with "
+            "--confirm it moves them to the trash."
         )
 
 

@@ -370,7 +370,7 @@ def test_backups_go_to_a_volume_that_outlives_the_release() -> None:
     (backup,) = of_kind("production", "CronJob")
     assert backup["spec"]["concurrencyPolicy"] == "Forbid"
     *command, folder = container(backup)["args"]
-    assert command == ["placewise", "backup"]
+    assert command == ["placewise", "storage", "backup"]
     mounts = {one["name"]: one["mountPath"] for one in container(backup)["volumeMounts"]}
     assert folder.startswith(mounts["backups"])
     volumes = {one["name"]: one for one in pod(backup)["spec"]["volumes"]}
@@ -393,7 +393,7 @@ def test_a_restore_runs_the_backup_job_with_another_command_and_no_service() -> 
     assert job["metadata"]["name"] == "placewise-backup"
     pod = job["spec"]["jobTemplate"]["spec"]["template"]["spec"]
     (container,) = pod["containers"]
-    assert container["args"] == ["placewise", "backup", "/backups/placewise"]
+    assert container["args"] == ["placewise", "storage", "backup", "/backups/placewise"]
     assert ("ConfigMap", container["envFrom"][0]["configMapRef"]["name"]) in names
     (claim,) = [v["persistentVolumeClaim"] for v in pod["volumes"] if "persistentVolumeClaim" in v]
     assert ("PersistentVolumeClaim", claim["claimName"]) in names

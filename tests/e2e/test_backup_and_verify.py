@@ -29,22 +29,22 @@ def test_a_running_server_is_backed_up_and_another_one_answers_as_it_did(
             photo_bytes(number), f"{number}.jpg", latitude=45 + number / 100, longitude=7
         )
     out = tmp_path / "backup"
-    about = run(server.home, "backup", out)
+    about = run(server.home, "storage", "backup", out)
     assert about["photos"] == 4
     assert about["missing"] == about["damaged"] == []
     query = photo_bytes(2)
     before = server.ask(query, top_k=3).json()["similar_images"]
 
-    refused = run(server.home, "restore", out, code=1)
+    refused = run(server.home, "storage", "restore", out, code=1)
     assert refused["code"] == "home_in_use"
     home = tmp_path / "other"
-    restored = run(home, "restore", out)
+    restored = run(home, "storage", "restore", out)
     assert restored["objects"] == about["objects"]
-    again = run(home, "restore", out, code=1)
+    again = run(home, "storage", "restore", out, code=1)
     assert again["code"] == "target_not_empty"
     with ServerProcess(home) as other:
         assert other.ask(query, top_k=3).json()["similar_images"] == before
-        assert run(home, "verify", "--originals")["faults"] == []
+        assert run(home, "storage", "verify", "--originals")["faults"] == []
 
 
 def test_a_damaged_chunk_of_a_running_server_is_found_and_described_again(
@@ -54,14 +54,14 @@ def test_a_damaged_chunk_of_a_running_server_is_found_and_described_again(
     damaged = chunk.with_suffix(".other")
     damaged.write_bytes(chunk.read_bytes()[:-1] + b"x")
     damaged.rename(chunk)  # the server may have mapped the file that was there
-    found = run(server.home, "verify", code=1)
+    found = run(server.home, "storage", "verify", code=1)
     assert [fault["wrong"] for fault in found["faults"]] == ["damaged"]
-    mended = run(server.home, "verify", "--repair", code=1)
+    mended = run(server.home, "storage", "verify", "--repair", code=1)
     assert mended["queued_photos"] >= 1
     for job in server.client.get("/api/v1/jobs").json()["jobs"]:
         if job["kind"] == "index":
             server.finished(job["job_id"])
-    assert run(server.home, "verify")["faults"] == []
+    assert run(server.home, "storage", "verify")["faults"] == []
 
 
 def test_one_scrape_of_the_embedded_server_has_metrics_of_all_its_parts(
@@ -97,6 +97,7 @@ def test_every_line_of_the_log_is_json_and_the_id_of_an_upload_is_in_several(
 
 def test_what_is_not_there_can_neither_be_backed_up_nor_verified(tmp_path: Path) -> None:
     for command in (["backup", tmp_path / "out"], ["verify"]):
-        assert run(tmp_path / "home", *command, code=1)["code"] == "nothing_stored"
+        refused = run(tmp_path / "home", "storage", *command, code=1)
+        assert refused["code"] == "nothing_stored"
     assert not (tmp_path / "out").exists()
     assert run(tmp_path / "home", "restore", tmp_path / "out", code=1)["code"] == "no_backup"

@@ -135,12 +135,12 @@ def test_wrong_catalog_stops_every_start_and_no_object_is_touched(
 ) -> None:
     before = {info.key for info in filled.store.list("")}
     wrong = shutil.copy(migrated_sqlite, tmp_path / "wrong.sqlite")
-    for command in ("serve", "steward", "verify"):
+    for command in (("serve",), ("steward",), ("storage", "verify")):
         filled.check_refused(
-            command,
+            *command,
             database_url=f"sqlite:///{wrong}",
             redis_url="redis://127.0.0.1:1/0",
-            **({} if command == "serve" else {"search_urls": "http://127.0.0.1:1"}),
+            **({} if command == ("serve",) else {"search_urls": "http://127.0.0.1:1"}),
         )
     assert {info.key for info in filled.store.list("")} == before
 
@@ -149,8 +149,8 @@ def test_older_catalog_stops_every_start_and_no_object_is_touched(filled: Filled
     before = {info.key for info in filled.store.list("")}
     filled.remove_catalog()
     shutil.copy(filled.older_catalog, filled.home / "catalog.sqlite")
-    for command in ("serve", "verify"):
-        done = filled.command(command)
+    for command in (("serve",), ("storage", "verify")):
+        done = filled.command(*command)
         assert done.returncode == 1
         assert "catalog_behind" in done.stderr
         assert "placewise storage rebuild" in done.stderr
@@ -202,7 +202,7 @@ def test_a_removed_catalog_stops_every_start_until_the_store_is_adopted_which_de
         assert confirmed["moved"] >= len(originals)
         assert filled.originals() == set()
         assert filled.stored_photos() >= originals
-        verified = json.loads(filled.command("verify", "--json").stdout)
+        verified = json.loads(filled.command("storage", "verify", "--json").stdout)
         assert verified["trash_objects"] == confirmed["moved"]
         assert verified["trash_bytes"] > 0
         back = json.loads(filled.command("storage", "restore-trash", "--json").stdout)

@@ -79,7 +79,7 @@ def test_removed_and_older_catalogs_lose_nothing(tmp_path: Path) -> None:
         assert {file_id: said_of(server, file_id) for file_id in retained} == fields
         assert {file_id: found_by(server, file_id) for file_id in retained} == found
         assert server.client.get(f"/api/v1/uploads/{deleted}").status_code == 404
-        assert run(home, "verify", "--originals")["faults"] == []
+        assert run(home, "storage", "verify", "--originals")["faults"] == []
         server.stop()
         assert objects(home, "originals/") == originals
         assert run(home, "storage", "rebuild", code=1)["code"] == "catalog_not_empty"
@@ -90,7 +90,9 @@ def test_removed_and_older_catalogs_lose_nothing(tmp_path: Path) -> None:
     for file in older.iterdir():
         shutil.copy(file, home)
     before = objects(home)
-    assert run(home, "backup", str(tmp_path / "backup"), code=1)["code"] == "catalog_behind"
+    assert (
+        run(home, "storage", "backup", str(tmp_path / "backup"), code=1)["code"] == "catalog_behind"
+    )
     assert objects(home) == before
     for file in catalog_files(home):
         file.unlink()
@@ -99,7 +101,7 @@ def test_removed_and_older_catalogs_lose_nothing(tmp_path: Path) -> None:
         assert {file_id: said_of(server, file_id) for file_id in retained} == fields
         assert {file_id: found_by(server, file_id) for file_id in retained} == found
         assert server.client.get(f"/api/v1/uploads/{deleted}").status_code == 404
-        assert run(home, "verify", "--originals")["faults"] == []
+        assert run(home, "storage", "verify", "--originals")["faults"] == []
 
 
 def wait_for_journal(home: Path, server: ServerProcess) -> None:

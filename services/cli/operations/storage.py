@@ -6,19 +6,17 @@ the bucket, assign the store to a catalog, and manage orphaned objects and the t
 
 from __future__ import annotations
 
+import contextlib
+from collections import Counter
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
 
 from services.cli.environment import read_settings
-from services.cli.operations.backup import (
-    backup,
-    progress_reporter,
-    rebuild_catalog,
-    restore,
-)
+from services.cli.operations.backup import backup, open_storage, rebuild, restore
 from services.cli.output import (
     JsonOption,
     console,
@@ -26,17 +24,46 @@ from services.cli.output import (
     print_message,
     print_note,
     print_result,
+    progress_bar,
+    stage_bars,
+)
+from services.steward.tasks.orphans import StoreCount, collect_orphans, count_store, find_orphans
+from shared.catalog.database.schema import check_schema, migrate
+from shared.catalog.database.session import NO_TIMEOUTS, Catalog
+from shared.catalog.installation import adopt_store, check_not_behind, get_or_create_installation
+from shared.catalog.tables import open_catalog
+from shared.config.embedded_home import lock_home
+from shared.errors import Conflict, Misconfigured
+from shared.integrity.referenced_objects import plural
+from shared.integrity.verify import IntegrityReport, repair_descriptors, verify_store
+from shared.jobs import InProcessWakeups
+from shared.storage import OwnedStore
+from shared.storage.open_store import open_store
+from shared.storage.ownership import read_owner
+from shared.storage.trash import (
+    Hold,
+    HoldReason,
+    measure_trash,
+    read_hold,
+    restore_trash,
+    write_hold,
+)
+from shared.telemetry.logs import configure_logging
+
+app = typer.Typer(
+    help="Verify, back up, restore and rebuild what is stored; manage the bucket, its owner, "
+    "orphans and trash.",
+    no_args_is_help=True,
 )
 
-if TYPE_CHECKING:
-    from services.steward.tasks.orphans import StoreCount
-    from shared.integrity.verify import IntegrityReport
-
+ConfirmOption = Annotated[
+    bool, typer.Option("--confirm", help="Apply the change. Without it, the command only reports.")
+]
 MAX_FAULTS_SHOWN = 20
 REMEDIES = {
-    "chunk": "placewise verify --repair queues their photos again",
-    "manifest": "placewise verify --repair queues the photos of their chunks again",
-    "photo": "placewise verify --repair queues them again",
+    "chunk": "placewise storage verify --repair queues their photos again",
+    "manifest": "placewise storage verify --repair queues the photos of their chunks again",
+    "photo": "placewise storage verify --repair queues them again",
     "original": "restore the object from a backup, or delete the photo and upload it again",
     "vocabulary": "restore the object from a backup, or fit a new vocabulary",
     "whitening": "restore the object from a backup, or create a new generation",
@@ -44,6 +71,7 @@ REMEDIES = {
 }
 
 
+@app.command("verify")
 def verify(
     originals: Annotated[
         bool, typer.Option("--originals", help="Also check every original photo against its hash.")
@@ -57,12 +85,17 @@ def verify(
 
     The exit code is 1 if a fault is found, even if it is repaired.
     """
-    with progress_reporter() as progress:
-        from services.cli.operations.maintenance import verify_storage
-
-        report, queued = verify_storage(
-            read_settings(), progress, originals=originals, repair=repair
-        )
+    with progress_bar() as bars, open_storage(read_settings(), "verify") as (catalog, store):
+        progress = stage_bars(bars)
+        report = verify_store(catalog, store, originals=originals, progress=progress)
+        for info in find_orphans(catalog, store, age_seconds=0.0):
+            report.orphans += 1
+            report.orphan_bytes += info.size_bytes
+            progress("orphaned objects", report.orphans, report.orphans)
+        trash = measure_trash(store)
+        report.trash_objects, report.trash_bytes = trash.objects, trash.size_bytes
+        # No wakeup message is needed: workers poll, and the steward sends messages.
+        queued = repair_descriptors(catalog, InProcessWakeups(), report) if repair else None
     if as_json:
         print_json(_report_as_json(report, queued))
     else:
@@ -89,8 +122,6 @@ def _report_as_json(report: IntegrityReport, queued: int | None) -> dict[str, An
 
 
 def _print_report(report: IntegrityReport, queued: int | None) -> None:
-    from shared.integrity.referenced_objects import plural
-
     checked = ", ".join(f"{count} {plural(kind)}" for kind, count in sorted(report.checked.items()))
     print_message(
         f"Checked {checked or 'nothing'} ({report.read_bytes / 1e6:.1f} MB): "
@@ -126,34 +157,25 @@ def _print_report(report: IntegrityReport, queued: int | None) -> None:
         print_note("Photos without their originals can't be described again.")
 
 
-app = typer.Typer(
-    help="Verify, back up, restore and rebuild what is stored; manage the bucket, its owner, "
-    "orphans and trash. `verify`, `backup` and `restore` also work without `storage`.",
-    no_args_is_help=True,
-)
+app.command("backup")(backup)
+app.command("restore")(restore)
+app.command("rebuild")(rebuild)
 
 
-def migrate() -> None:
+@app.command("migrate")
+def migrate_catalog() -> None:
     """Create the catalog's tables in an empty database (DATABASE_URL).
 
     Run it before the services start. It changes nothing where they exist, and refuses the tables of
     another version.
     """
-    from services.service_process import migrate_catalog
-
-    installation_id = migrate_catalog(read_settings())
+    settings = read_settings()
+    configure_logging(settings, "migrate", to_file=False)
+    with contextlib.closing(open_catalog(settings, "migrate")) as catalog:
+        migrate(catalog)
+        with catalog.write() as session:
+            installation_id = get_or_create_installation(session).id
     print_note(f"The catalog has its tables (installation {installation_id})")
-
-
-app.command("verify")(verify)
-app.command("backup")(backup)
-app.command("restore")(restore)
-app.command("rebuild")(rebuild_catalog)
-app.command("migrate")(migrate)
-
-ConfirmOption = Annotated[
-    bool, typer.Option("--confirm", help="Apply the change. Without it, the command only reports.")
-]
 
 
 @app.command("create-bucket")
@@ -183,9 +205,28 @@ def adopt(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
     afterwards. Objects that are not in this catalog are kept until you run `placewise storage
     collect --confirm`.
     """
-    from services.cli.operations.maintenance import adopt_storage
-
-    count = adopt_storage(read_settings(), confirm=confirm)
+    settings = read_settings()
+    with contextlib.ExitStack() as stack:
+        if settings.database_url is None:
+            stack.enter_context(lock_home(settings.placewise_home))
+        opened = open_catalog(settings, "storage", NO_TIMEOUTS)
+        catalog = stack.enter_context(contextlib.closing(opened))
+        store = open_store(settings, exclusive=False)
+        store.check()
+        if confirm and catalog.is_sqlite:
+            migrate(catalog)
+        is_new = catalog.is_sqlite and not Path(catalog.url.database or "").exists()
+        if not is_new:
+            check_schema(catalog)
+            _check_not_owned(catalog, store)
+        count = count_store(None if is_new else catalog, store)
+        unknown = count.orphans.total()
+        if confirm:
+            # The hold comes first: without it, this catalog's steward could collect the objects.
+            if unknown:
+                unknown_bytes = count.orphan_bytes.total()
+                write_hold(store, Hold(HoldReason.ADOPTED, unknown, unknown_bytes, count.objects))
+            adopt_store(catalog, store)
     if as_json:
         print_json({"adopted": confirm, **_as_dict(count)})
         return
@@ -201,6 +242,15 @@ def adopt(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
         )
 
 
+def _check_not_owned(catalog: Catalog, store: OwnedStore) -> None:
+    with catalog.write() as session:
+        installation_id = get_or_create_installation(session).id
+    if read_owner(store) == str(installation_id):
+        with contextlib.suppress(Misconfigured):  # an older catalog may be made the owner
+            check_not_behind(catalog, store)
+            raise Conflict("already_owner", "This catalog already owns the store.")
+
+
 @app.command("collect")
 def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
     """Count orphaned objects by prefix; with --confirm, move them to the trash.
@@ -208,10 +258,15 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
     Orphans are objects older than ORPHAN_AGE_SECONDS that are not in the catalog. --confirm also
     overrides a hold on garbage collection. Services can keep running.
     """
-    from services.cli.operations.maintenance import collect_storage
-
     settings = read_settings()
-    count, moved, hold = collect_storage(settings, confirm=confirm)
+    with open_storage(settings, "storage") as (catalog, store):
+        count, moved, hold = StoreCount(), 0, read_hold(store)
+        for _ in find_orphans(catalog, store, settings.orphan_age_seconds, count):
+            pass
+        while confirm and (
+            batch := collect_orphans(catalog, store, settings.orphan_age_seconds, confirmed=True)
+        ):
+            moved += batch
     if as_json:
         hold_reason = None if hold is None else hold.reason
         print_json({"moved": moved, "held": hold_reason, **_as_dict(count)})
@@ -230,7 +285,7 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
 
 
 @app.command("restore-trash")
-def restore_trash(
+def restore_from_trash(
     prefix: Annotated[
         str,
         typer.Option(
@@ -244,9 +299,8 @@ def restore_trash(
     This does not add them to the catalog: they are orphans again and are kept for another
     ORPHAN_AGE_SECONDS. `placewise storage rebuild` creates a catalog from all objects.
     """
-    from services.cli.operations.maintenance import restore_from_trash
-
-    counts = restore_from_trash(read_settings(), prefix)
+    with open_storage(read_settings(), "storage") as (_, store):
+        counts = Counter(was_restored for _, was_restored in restore_trash(store, prefix))
     restored, skipped = counts[True], counts[False]
     if as_json:
         print_json({"restored": restored, "kept_in_trash": skipped})

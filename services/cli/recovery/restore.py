@@ -52,7 +52,7 @@ def open_backup(folder: BackupFolder) -> tuple[BackupManifest, dict[str, BackedU
         raise Misconfigured(
             "no_backup",
             f"{folder.path} has no finished backup (no backup.json). If a backup was interrupted, "
-            "run `placewise backup` on it again.",
+            "run `placewise storage backup` on it again.",
         )
     return manifest, folder.read_index(manifest.index)
 
@@ -130,7 +130,7 @@ def _copy_objects(
             "backup_damaged",
             f"{len(damaged)} objects of the backup are missing or damaged: {names}. Use another "
             "backup. To restore the rest without them, delete their lines from the file that "
-            f"`index` in {folder.path / 'backup.json'} names, and run `placewise verify --repair` "
-            "afterwards.",
+            f"`index` in {folder.path / 'backup.json'} names, and run `placewise storage verify "
+            "--repair` afterwards.",
         )
     return copied

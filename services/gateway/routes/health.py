@@ -251,7 +251,7 @@ def _check_search(gateway: GatewayContext) -> ComponentStatus:
         problems.append(
             f"{len(status.missing)} chunks can't be read: {named}"
             + (f" and {more} more" if more > 0 else "")
-            + " (repair them with placewise verify --repair)"
+            + " (repair them with placewise storage verify --repair)"
         )
     if problems:
         return ComponentStatus(status="degraded", detail="; ".join(problems))

@@ -2,7 +2,7 @@
 
 A generation is activated once every live search worker has loaded all of it. An unreadable chunk
 would block that forever, so its photos are queued for the extractors again. Chunks of the active
-generation are repaired by `placewise verify --repair`.
+generation are repaired by `placewise storage verify --repair`.
 """
 
 from __future__ import annotations

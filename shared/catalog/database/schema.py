@@ -201,8 +201,8 @@ MAX_CHECKED_BYTES = 256_000_000
 
 REMEDIES = (
     "Move it and its -wal and -shm files away without deleting them, then restore a backup "
-    "(placewise restore FOLDER, into an empty PLACEWISE_HOME) or create a new catalog from the "
-    "object store (placewise storage rebuild)."
+    "(placewise storage restore FOLDER, into an empty PLACEWISE_HOME) or create a new catalog from "
+    "the object store (placewise storage rebuild)."
 )
 
 

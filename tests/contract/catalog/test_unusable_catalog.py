@@ -80,8 +80,8 @@ def make_folder(file: Path) -> None:
     ("damage", "code", "says"),
     [
         (damage_pages, "catalog_damaged", "placewise storage rebuild"),
-        (damage_last_page, "catalog_damaged", "placewise restore FOLDER"),
-        (truncate, "catalog_damaged", "placewise restore FOLDER"),
+        (damage_last_page, "catalog_damaged", "placewise storage restore FOLDER"),
+        (truncate, "catalog_damaged", "placewise storage restore FOLDER"),
         (no_sqlite, "catalog_damaged", "file is not a database"),
         (make_folder, "catalog_is_folder", "is a folder"),
     ],
@@ -110,7 +110,7 @@ def test_a_file_that_may_not_be_written_is_named(
 def test_a_large_catalog_is_read_whole_by_the_doctor_only(file: Path, catalog: Catalog) -> None:
     damage_last_page(file)
     check_pages(catalog, max_bytes=PAGE_BYTES)
-    with pytest.raises(Misconfigured, match="placewise restore"):
+    with pytest.raises(Misconfigured, match="placewise storage restore"):
         check_pages(catalog, max_bytes=None)
 
 
