@@ -223,8 +223,6 @@ class AsyncClient(AsyncTransport):
         """Add a frame to a track. The photo is not stored in the map.
 
         Args:
-            track_id: The track.
-            photo: The file.
             captured_at: When it was taken; unique in the track.
             wait: Wait for the state; False returns as soon as the frame is stored.
             expected_version: Version that the track must have, such as `version` of the frame
@@ -290,7 +288,6 @@ class AsyncClient(AsyncTransport):
         """Poll a job and iterate over its states; the last one is its end, also if it failed.
 
         Args:
-            work: The job.
             timeout_seconds: Maximum time to wait; None for no limit.
             poll_seconds: Maximum duration of a poll, which ends early when the job ends.
 
@@ -322,7 +319,6 @@ class AsyncClient(AsyncTransport):
         """Wait until a job succeeds.
 
         Args:
-            work: The job.
             timeout_seconds: Maximum time to wait; None for no limit.
             on_progress: Called with the job after every poll.
             poll_seconds: Maximum duration of a poll, which ends early when the job ends.
@@ -401,9 +397,7 @@ class AsyncClient(AsyncTransport):
         Without arguments, PCA is undone for an extractor without a vocabulary.
 
         Args:
-            vocabulary_id: One of the map's vocabularies.
             pca: Number of dimensions to reduce to by PCA whitening.
-            extractor: Another extractor.
         """
         body = drop_none(
             vocabulary_id=vocabulary_id and str(vocabulary_id), pca=pca, extractor=extractor
@@ -423,7 +417,6 @@ class AsyncClient(AsyncTransport):
         """Download a tar with `descriptors.npy`, `names.txt` and `photos.csv` into a file.
 
         Args:
-            generation_id: A generation of the map.
             file: Seekable and writable; overwritten from its beginning.
             on_received: Called with the number of bytes received so far.
         """
@@ -520,10 +513,7 @@ class AsyncClient(AsyncTransport):
         """Start adding a checkpoint of `placewise train` as an extractor.
 
         Args:
-            checkpoint: The file.
             name: Permanent name; maps refer to it as `gsv:NAME`.
-            licence: Licence of the weights.
-            note: Free text.
             on_sent: Called with the number of bytes sent so far.
         """
         data = drop_none(name=name, licence=licence, note=note)

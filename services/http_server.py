@@ -63,8 +63,6 @@ def http_server(
     """Creates a server for the application without starting it.
 
     Args:
-        app: The application.
-        connections: Applies the connection limits.
         on_stop: Called on the event loop when the shutdown begins. Requests in flight have
             SHUTDOWN_GRACE_SECONDS to finish.
     """

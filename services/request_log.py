@@ -64,7 +64,6 @@ class RequestLogMiddleware:
         """Creates the middleware.
 
         Args:
-            app: The next ASGI application.
             quiet: Log all requests except those with 5xx responses at DEBUG.
             on_start: Called when a request starts, for metrics.
             on_end: Called with the record when it has ended, for metrics.

@@ -95,7 +95,6 @@ class Authenticator(Protocol):
         """Return the caller of a request.
 
         Args:
-            headers: The request's headers.
             peer: Address of the connection, whatever the headers say; None if unknown.
 
         Raises:

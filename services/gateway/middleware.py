@@ -69,7 +69,6 @@ class BodySizeLimitMiddleware:
     """Responds 413 (`body_too_large`) to bodies over MAX_JSON_BYTES without reading the rest.
 
     Args:
-        app: The application.
         form_paths: Matches the paths of the routes that limit multipart bodies themselves. Any
             other route would read such a body into memory.
         exempt_paths: Paths of the routes that limit all their bodies themselves.

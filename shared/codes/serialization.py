@@ -44,9 +44,6 @@ def decode_sign_codes(data: Any, *, rows: int, dimension: int, chunk_sha256: str
 
     Args:
         data: The buffer, which the codes refer to.
-        rows: Number of rows of the chunk.
-        dimension: Dimension of the rows.
-        chunk_sha256: Hash of the chunk.
 
     Raises:
         ValueError: The codes belong to another chunk, have other parameters, or are damaged.

@@ -41,10 +41,6 @@ def claim_jobs(
     Args:
         session: The session of a write transaction.
         worker: Name of the worker, stored with the jobs.
-        limit: Largest number of jobs.
-        lease_seconds: Duration of the lease.
-        kinds: Kinds of jobs that the worker runs.
-        min_priority: Jobs of a lower priority are not claimed.
         alone: Whether to claim jobs that have to be retried alone.
         started: False for a worker that begins with steps that can't crash it (reading, decoding):
             if it dies before it calls `mark_started`, the jobs are not blamed.

@@ -105,8 +105,6 @@ def requeue_job(
     A checkpointed job stays `running` between its slices; any other job is `queued` again.
 
     Args:
-        job: The claimed job.
-        after_seconds: Delay before it may be claimed.
         waiting_for: What it waits for; it can't be claimed until `make_waiting_jobs_claimable`.
         problem: Why it has to be retried, an RFC 9457 problem.
     """

@@ -90,7 +90,6 @@ def configure_tracing(
 
     Args:
         settings: OTEL_EXPORTER_OTLP_ENDPOINT turns tracing on.
-        exporter: replaces the OTLP exporter.
 
     Raises:
         Misconfigured: `otel_missing` where tracing is on without the extra `otel`.

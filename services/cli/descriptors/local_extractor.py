@@ -251,7 +251,6 @@ def describe_files(
     Args:
         photos: Photo files, in row order.
         out: Output file: `.npy`, or with `names`, one per photo, HDF5 in hloc's format.
-        config: The configuration of the extractor.
         vocabulary: VLAD vocabulary; None for the shipped one.
         pca: PCA whitening to apply, or None.
         settings: Device, precision, batch size and decoder limits.

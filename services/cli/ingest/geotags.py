@@ -168,7 +168,6 @@ def read_photo_manifest(manifest: Path, data: bytes) -> list[LocalPhoto]:
 
     Args:
         manifest: Path of the manifest; file names in it are relative to its folder.
-        data: Content of the manifest.
 
     Raises:
         InvalidRequest: `bad_manifest` for invalid lines and for photos that don't exist;

@@ -275,7 +275,6 @@ def picture_evidence(answer: Similar, photo_count: int) -> PictureEvidence:
     """Return what a search says about the position.
 
     Args:
-        answer: The response.
         photo_count: Number of photos of the map.
     """
     estimate = answer.estimate

@@ -32,7 +32,6 @@ def read_folder(
     """Read the photos below a folder, sorted by path.
 
     Args:
-        folder: The folder.
         time_zone: Zone of times without one, such as `+02:00` or `Europe/Paris`.
         clock_offset_seconds: How far the clock was ahead of every camera that took a photo
             without coordinates.

@@ -66,8 +66,6 @@ def write_locations(folder: Path, target: Target, locations: Sequence[Location])
     """Write proposals, with a journal that undoes it.
 
     Args:
-        folder: The folder that the photos are in.
-        target: What to write.
         locations: The proposals. Those without coordinates can only be written to a CSV table.
 
     Raises:

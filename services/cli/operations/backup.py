@@ -52,7 +52,6 @@ def open_storage(settings: Settings, command: str) -> Iterator[tuple[Catalog, Ow
     """Open the catalog and the object store, whether or not services are running.
 
     Args:
-        settings: Settings that locate both.
         command: Name of the command, shown as the database connection's application name.
 
     Raises:

@@ -76,8 +76,6 @@ def write_track_file(file: Path, track: OneTrack, photos: Sequence[Photo]) -> No
     """Write a track in the format of the file's extension.
 
     Args:
-        file: The output file.
-        track: The track.
         photos: The photos of the map, for a picture.
     """
     content = WRITERS[file.suffix.lower()](track, photos)

@@ -280,7 +280,6 @@ def validate_prefix(value: str, settings: Settings) -> str:
 
     Args:
         value: A prefix below `imports/`, or the same as `s3://S3_BUCKET/...`.
-        settings: The settings.
 
     Raises:
         Unprocessable: `invalid_field`, if it is another bucket or not below `imports/`.

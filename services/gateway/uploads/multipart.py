@@ -53,8 +53,6 @@ class MultipartFormParser:
 
         Args:
             request: Its headers give the boundary and the declared size.
-            handler: Receives the parts.
-            max_bytes: Maximum size of the body.
             too_large: Builds the exception for a larger body.
 
         Raises:
@@ -201,10 +199,7 @@ async def receive_form_file(
     threads costs as much as a statement. Nothing is left in the store if it raises before.
 
     Args:
-        request: The request whose body is read.
-        store: The object store.
         make_key: Makes the object key of the file from its name.
-        max_bytes: Maximum size of the file.
         check_begin: Called with the first bytes before the rest is read; may raise.
         too_large: Builds the exception for a file of more than `max_bytes`.
 
@@ -255,7 +250,6 @@ def multipart_schema(
 
     Args:
         file: Description of the file.
-        required: Required text fields.
         fields: JSON schemas of the text fields.
     """
     properties = {FILE_FIELD: {"type": "string", "format": "binary", "description": file}, **fields}

@@ -49,8 +49,6 @@ def merge_small_chunks(
     """Merge every slot that needs it.
 
     Args:
-        catalog: The catalog.
-        store: The object store with the chunks.
         compact_chunks: New chunks of an open slot are merged from this number on.
         retries: Backoff for slots with unreadable chunks, so that not every run reads them.
 

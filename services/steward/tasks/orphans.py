@@ -99,8 +99,6 @@ def collect_orphans(
     """Move objects that no catalog row refers to to the trash, up to MAX_ORPHANS_PER_RUN.
 
     Args:
-        catalog: The catalog that refers to the objects.
-        store: The catalog's object store.
         age_seconds: Younger objects stay, because their rows may not be committed yet.
         confirmed: Move the orphans also where collection would be held.
 
