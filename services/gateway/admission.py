@@ -136,9 +136,9 @@ class AdmissionControl:
             for kind in UploadKind
         }
         self.event_streams = _ConcurrencyLimit(
-            "event streams (MAX_EVENT_STREAMS)",
+            "event streams (a quarter of MAX_CONNECTIONS)",
             "too_many_event_streams",
-            total=settings.max_event_streams,
+            total=settings.max_connections // 4,  # each occupies one as long as its job runs
             retry_after_seconds=STREAM_RETRY_SECONDS,
         )
         self.smoothed_tracks = _ConcurrencyLimit(

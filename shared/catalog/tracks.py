@@ -34,6 +34,7 @@ from shared.errors import Conflict, NotFound
 from shared.ids import new_id
 
 MAX_TRACK_FRAMES = 10_000
+RETENTION_DAYS = 30.0  # after the last frame; as long as finished jobs
 MAX_SMOOTHED_FRAMES = 3000  # a request takes about a minute
 MAX_LATE_FRAMES = 50
 """A frame may be inserted before at most so many frames of its track."""

@@ -76,11 +76,14 @@ class ExtractorSettings(BaseSettings):
         description="DINOv2's weights: a .pth, .pt or .safetensors file; unset: timm's, downloaded "
         "from the Hugging Face hub",
     )
-    batch_photos: int = Field(16, ge=1, le=1024, description="maximum photos of an inference batch")
-    decode_processes: int = Field(2, ge=1, le=64, description="number of decoding processes")
-    batch_ahead_photos: int = Field(
-        500, ge=1, description="queued photos at which batch uploads wait for the extractors"
+    batch_photos: int = Field(
+        16,
+        ge=1,
+        le=1024,
+        description="maximum photos of an inference batch; batch uploads wait while 32 times as "
+        "many are queued",
     )
+    decode_processes: int = Field(2, ge=1, le=64, description="number of decoding processes")
     pool_without_vocabulary: bool = Field(
         True,
         description="describe the photos of a map whose extractor is shipped without a vocabulary "

@@ -36,7 +36,8 @@ class GatewaySettings(BaseSettings):
     max_connections: int = Field(
         2000,
         ge=1,
-        description="open connections of one server; fewer where the limit of open files is lower",
+        description="open connections of one server, a quarter of them event streams "
+        "(GET /jobs/ID/events); fewer where the limit of open files is lower",
     )
     max_connections_per_address: int = Field(
         200,
@@ -59,12 +60,6 @@ class GatewaySettings(BaseSettings):
         "",
         description="scopes of the groups of signed-in users, separated by commas; `*` is every "
         "user: *:read, editors:write, vpr-admins:admin",
-    )
-    max_event_streams: int = Field(
-        500,
-        ge=0,
-        description="open event streams (GET /jobs/ID/events) of one gateway; one key or address "
-        "may have half of them",
     )
 
     # Rate limit and quotas of keys that have none of their own. ADMIN_KEY is not limited.
@@ -103,17 +98,14 @@ class GatewaySettings(BaseSettings):
     max_image_pixels: int = Field(
         200_000_000, gt=0, description="maximum width x height of one photo"
     )
-    max_batch_photos: int = Field(100_000, gt=0, description="maximum photos in one batch")
 
     # Backpressure: requests are rejected before a queue or a disk fills up.
     max_queued_jobs: int = Field(
         200_000,
         ge=1,
         description="queued jobs at which requests that create further jobs are rejected; one map "
-        "may have half of them",
-    )
-    max_queued_queries: int = Field(
-        1000, ge=1, description="maximum queued query photos; uploads do not count"
+        "may have half of them, so that a batch has at most as many photos, and query photos may "
+        "be a 200th",
     )
     max_concurrent_uploads: int = Field(
         32,
@@ -207,6 +199,16 @@ class GatewaySettings(BaseSettings):
                 f"{OPENSTREETMAP_ATTRIBUTION}"
             )
         return self
+
+    @property
+    def max_queued_queries(self) -> int:
+        """Queued query photos, without uploads: their callers wait, so fewer than other jobs."""
+        return max(1, self.max_queued_jobs // 200)
+
+    @property
+    def max_batch_photos(self) -> int:
+        """Photos of one batch, which become jobs of one map."""
+        return self.max_queued_jobs // 2
 
     @property
     def tile_attribution(self) -> str | None:

@@ -97,9 +97,6 @@ class JobSettings(BaseSettings):
     search_history_days: float = Field(
         90.0, gt=0, description="retention of a search in the history, days"
     )
-    track_retention_days: float = Field(
-        30.0, gt=0, description="retention of a track after its last frame, days"
-    )
     auto_evaluate_photos: int = Field(
         20,
         ge=0,

@@ -186,7 +186,7 @@ def test_export_writes_what_other_programs_read(server: ServerProcess, tmp_path:
 
 def test_a_batch_goes_on_after_each_kill_and_brings_each_photo_in_once(tmp_path: Path) -> None:
     count = 120
-    with ServerProcess(tmp_path / "home", batch_ahead_photos=20) as server:
+    with ServerProcess(tmp_path / "home", batch_photos=1) as server:
         answer = server.client.post("/api/v1/upload/batch", files=form(*range(count)))
         job_url = f"/api/v1/jobs/{answer.json()['job_id']}"
         for reached in (10, 40, 80):
@@ -213,7 +213,7 @@ def test_a_batch_in_separate_services_outlives_its_steward(
     with start_redis(own=True) as redis:
         deployment = Deployment(tmp_path, postgres.new_database(), redis.url)
         try:
-            deployment.settings |= s3.variables(bucket.name) | {"batch_ahead_photos": 10}
+            deployment.settings |= s3.variables(bucket.name) | {"batch_photos": 1}
             deployment.migrate()
             deployment.start("search")
             deployment.settings["search_urls"] = deployment.address("search", 0)

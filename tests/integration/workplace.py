@@ -141,13 +141,6 @@ class Workplace:
         assert building is not None
         return job_id, building.id
 
-    def take_over(self, jobs: list[UUID]) -> None:
-        """The leases of the jobs expire and are freed."""
-        for job_id in jobs:
-            set_columns(self.catalog, job_id, lease_until=None)
-        with self.catalog.write() as session:
-            reclaim_expired_leases(session, all_leases=True)
-
     # --- what can be seen ---
 
     def await_end(self, job_id: UUID) -> JobState:

@@ -53,6 +53,7 @@ from shared.catalog.jobs import QUERY_TTL_SECONDS
 from shared.catalog.maps import get_map
 from shared.catalog.tracks import (
     MAX_SMOOTHED_FRAMES,
+    RETENTION_DAYS,
     Track,
     TrackFrame,
     add_frame,
@@ -386,7 +387,6 @@ async def _wait_until_applied(
 def _track_fields(gateway: GatewayContext, track: Track, last: TrackFrame | None) -> dict[str, Any]:
     """Return the fields of `TrackResponse`; `last` is the last applied frame."""
     params = TrackParams.model_validate(track.params)
-    life = timedelta(days=gateway.settings.track_retention_days)
     return {
         "track_id": track.id,
         "motion": params.motion,
@@ -396,7 +396,7 @@ def _track_fields(gateway: GatewayContext, track: Track, last: TrackFrame | None
         "state": None if last is None else last.state,
         "created_at": track.created_at,
         "updated_at": track.updated_at,
-        "expires_at": track.updated_at + life,
+        "expires_at": track.updated_at + timedelta(days=RETENTION_DAYS),
     }
 
 

@@ -21,7 +21,6 @@ from shared.search_api.protocol import Mode
 
 TIME = "ISO 8601; no offset means UTC"
 MAX_IDS = 1000
-MAX_INTEGER = 2**53 - 1  # of JSON in all languages
 MAX_IDS_CHARACTERS = 40_000
 
 

@@ -252,7 +252,7 @@ def too_many_photos_error(limit: int) -> PlacewiseError:
     """Build the 413 error for a batch of more than `limit` photos."""
     return TooLarge(
         "too_many_photos",
-        f"The batch has more than {limit} photos (MAX_BATCH_PHOTOS). Split it into several.",
+        f"The batch has more than {limit} photos (half of MAX_QUEUED_JOBS). Split it into several.",
     )
 
 

@@ -45,8 +45,8 @@ def list_prefix_photos(store: ObjectStore, prefix: str, max_photos: int) -> Batc
         if len(keys) > max_photos:
             raise TooLarge(
                 "too_many_photos",
-                f"There are more than {max_photos} photos under {prefix} (MAX_BATCH_PHOTOS). "
-                "Use a longer prefix.",
+                f"There are more than {max_photos} photos under {prefix} (half of "
+                "MAX_QUEUED_JOBS). Use a longer prefix.",
             )
     if not keys:
         raise Unprocessable("no_photos", f"The object store has no photos under {prefix}.")

@@ -1,7 +1,7 @@
 """Worker for batch jobs: imports the photos of a batch in slices, with backpressure.
 
 It runs in a thread of its own, parallel to the periodic tasks. A slice ends after SLICE_SECONDS, so
-that several batches take turns, and at most BATCH_AHEAD_PHOTOS photos wait for the extractors.
+that several batches take turns, and at most `ahead_photos` photos wait for the extractors.
 
 A photo takes the path of an upload: its bytes are stored and checked, then the photo row, its job
 and the item are written in one transaction, under the batch's lease. The bytes of a rejected photo
@@ -202,6 +202,7 @@ class _BatchItemImporter:
 SLICE_SECONDS = 2.0
 PROGRESS_POLL_SECONDS = 0.5  # between two checks of the extractors' progress
 YIELD_SECONDS = 0.1  # pause of a batch, so that another one is claimed first
+AHEAD_BATCHES = 32  # photos, in batches of BATCH_PHOTOS, that a batch job may queue at once
 READ_ITEMS = 50  # items per query
 
 
@@ -249,10 +250,12 @@ class BatchWorker:
         settings: Settings,
         name: str,
         metrics: StewardMetrics | None = None,
+        ahead_photos: int | None = None,
     ) -> None:
         self._catalog = catalog
         self._store = store
         self._settings = settings
+        self._ahead_photos = ahead_photos or AHEAD_BATCHES * settings.batch_photos
         self._disk = DiskSpace(settings)
         self._importer = _BatchItemImporter(catalog, store, wakeups, settings)
         metrics = metrics or StewardMetrics(CollectorRegistry())
@@ -317,7 +320,7 @@ class BatchWorker:
 
     def _next_items(self, job: Job) -> list[BatchItem]:
         """Return the next queued items, up to the free capacity of the extractors' queue."""
-        max_queued = self._settings.batch_ahead_photos
+        max_queued = self._ahead_photos
         with self._catalog.read() as session:
             room = max_queued - count_queued_photos(session, max_queued)
             return next_queued_items(session, job.id, min(READ_ITEMS, room)) if room > 0 else []
@@ -347,7 +350,7 @@ class BatchWorker:
             update_batch_progress(leased, counts)
 
     def _pause_seconds(self, session: Session, job: Job) -> float:
-        max_queued = self._settings.batch_ahead_photos
+        max_queued = self._ahead_photos
         if count_queued_photos(session, max_queued) == max_queued:
             return PROGRESS_POLL_SECONDS
         other = select(Job.id).where(claimable_condition((JobKind.BATCH,)), Job.id != job.id)

@@ -27,7 +27,7 @@ from shared.catalog.maps import (
     list_maps_with_cached_statistics,
 )
 from shared.catalog.photos import Photo
-from shared.catalog.tracks import Track, delete_tracks
+from shared.catalog.tracks import RETENTION_DAYS, Track, delete_tracks
 from shared.catalog.webhooks import Delivery
 from shared.config.settings import Settings
 from shared.jobs import Wakeups, reclaim_expired_leases
@@ -94,11 +94,11 @@ def delete_old_searches(catalog: Catalog, settings: Settings) -> None:
 
 
 @periodic_task(10.0)
-def delete_old_tracks(catalog: Catalog, settings: Settings) -> None:
-    """Delete tracks without a new frame for TRACK_RETENTION_DAYS."""
+def delete_old_tracks(catalog: Catalog) -> None:
+    """Delete tracks without a new frame for RETENTION_DAYS."""
     old = (
         select(Track.id)
-        .where(Track.updated_at < _days_ago(settings.track_retention_days))
+        .where(Track.updated_at < _days_ago(RETENTION_DAYS))
         .limit(TRACKS_PER_TRANSACTION)
         .with_for_update(skip_locked=True)
     )

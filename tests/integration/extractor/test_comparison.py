@@ -201,7 +201,7 @@ def test_comparisons_wait_in_the_queue_of_queries(
 ) -> None:
     with catalog.write() as session:
         get_or_create_default_map(session, settings.extractor)
-    few = settings.model_copy(update={"max_queued_queries": 1})
+    few = settings.model_copy(update={"max_queued_jobs": 200})
     service = Service(catalog, store, few, make_worker)
     query = service.indexed(0, 1)[0]
     begun(service, f"/similarity/{query}")

@@ -118,7 +118,7 @@ def test_all_maps_together_have_a_limit_and_queries_pass_it(
 
 
 def test_queries_have_a_limit_of_their_own_and_uploads_pass_it(make_service: Make) -> None:
-    service = make_service(max_queued_queries=1)
+    service = make_service(max_queued_jobs=200)
     service.ask(near_copy(1))
     files = {"file": ("query.jpg", near_copy(2))}
     body = queue_full(service("POST", "/similarity", files=files))
@@ -324,10 +324,10 @@ def test_an_event_stream_too_many_is_refused_and_one_that_ended_makes_room(
     with catalog.write() as session:
         ended = add_job(session, get_map(session, "city").id, state=JobState.FAILED).id
     events = f"/jobs/{ended}/events?map=city"
-    service = make_service(max_event_streams=1)
+    service = make_service(max_connections=4)
     for _ in range(2):
         assert service("GET", events).text.startswith("id: 1\nevent: progress\n")
-    refused = make_service(max_event_streams=0)("GET", events)
+    refused = make_service(max_connections=3)("GET", events)
     problem(refused, 429, "too_many_event_streams")
     assert int(refused.headers["retry-after"]) >= 1
 
@@ -338,13 +338,13 @@ def test_health_says_how_full_things_are(
 ) -> None:
     receiving = {UploadKind.UPLOAD: 3, UploadKind.QUERY: 2}
     monkeypatch.setattr(AdmissionControl, "active_uploads", lambda _, kind: receiving[kind])
-    service = make_service(max_queued_jobs=50, max_queued_queries=7)
+    service = make_service(max_queued_jobs=1400)
     with catalog.write() as session:
         city = get_map(session, "city").id
         session.add(Job(map_id=city, kind=JobKind.INDEX, priority=Priority.UPLOAD))
     service.ask(near_copy(1))
     load = service.json("GET", "/health")["load"]
-    assert (load["waiting_jobs"], load["max_queued_jobs"]) == (1, 50)
+    assert (load["waiting_jobs"], load["max_queued_jobs"]) == (1, 1400)
     assert (load["waiting_queries"], load["max_queued_queries"]) == (1, 7)
     assert (load["receiving_uploads"], load["receiving_queries"]) == (3, 2)
     assert load["free_bytes"] > 0

@@ -23,7 +23,6 @@ from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import Job
 from shared.catalog.tracks import Track, TrackFrame
-from shared.config.settings import Settings
 from shared.search_api.protocol import SearchRequest, SearchResponse
 from shared.storage.keys import query_key, query_vector_key
 from tests.integration.in_process_api import Service
@@ -372,7 +371,7 @@ def test_what_belongs_to_a_track_stays_and_goes_with_it(street: Service, catalog
         session.execute(
             update(Track).where(Track.id == UUID(done)).values(updated_at=db_now_plus(-31 * 86_400))
         )
-    delete_old_tracks(catalog, Settings())
+    delete_old_tracks(catalog)
     assert [item["track_id"] for item in street.json("GET", "/tracks")["tracks"]] == [pending]
     street.json("DELETE", "/maps/default")
     purge_deleted_maps(catalog, street.store)

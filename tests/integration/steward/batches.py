@@ -29,10 +29,17 @@ class Batches:
         self.catalog, self.store = service.catalog, service.store
         self.worker = self.new_worker()
 
-    def new_worker(self, **changed: Any) -> BatchWorker:
+    def new_worker(self, ahead_photos: int | None = None, **changed: Any) -> BatchWorker:
         """As after a restart, with other settings if need be."""
         settings = self.settings.model_copy(update=changed)
-        return BatchWorker(self.catalog, self.store, InProcessWakeups(), settings, "steward")
+        return BatchWorker(
+            self.catalog,
+            self.store,
+            InProcessWakeups(),
+            settings,
+            "steward",
+            ahead_photos=ahead_photos,
+        )
 
     def start(self, *files: tuple[str, bytes], **parts: Any) -> UUID:
         """`POST /upload/batch` with these files, and a `manifest` or `prefix`; its job."""

@@ -137,7 +137,7 @@ def queued_photos(catalog: Catalog) -> int:
 
 def test_a_batch_brings_in_no_more_than_the_extractors_have_room_for(batches: Batches) -> None:
     job_id = batches.start(*files(*range(10)))
-    worker = batches.new_worker(batch_ahead_photos=4)
+    worker = batches.new_worker(ahead_photos=4)
     for _ in range(3):
         batches.work(worker)
     assert queued_photos(batches.catalog) == 4
@@ -169,7 +169,7 @@ def test_batches_take_turns(batches: Batches, monkeypatch: pytest.MonkeyPatch) -
 def test_cancelling_ends_what_has_not_ended(batches: Batches) -> None:
     batches.service.indexed(0)
     job_id = batches.start(*files(*range(8)))
-    worker = batches.new_worker(batch_ahead_photos=3)
+    worker = batches.new_worker(ahead_photos=3)
     batches.work(worker)
     batches.service.drain()
     batches.work(worker)
@@ -187,7 +187,7 @@ def test_a_cancelled_batch_cancels_its_photos_in_small_transactions(
     batches: Batches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job_id = batches.start(*files(*range(7)))
-    batches.work(batches.new_worker(batch_ahead_photos=5))
+    batches.work(batches.new_worker(ahead_photos=5))
     monkeypatch.setattr("shared.jobs.transitions.CANCELLED_PER_TRANSACTION", 2)
     cancelled = batches.service.json("POST", f"/jobs/{job_id}/cancel")
     assert cancelled["state"] == "cancelled"
@@ -224,7 +224,7 @@ def test_retry_queues_the_failed_items_again_whose_bytes_are_there(batches: Batc
 
 def test_retry_describes_the_photos_of_a_cancelled_batch(batches: Batches) -> None:
     job_id = batches.start(*files(*range(6)))
-    batches.work(batches.new_worker(batch_ahead_photos=4))
+    batches.work(batches.new_worker(ahead_photos=4))
     batches.service.json("POST", f"/jobs/{job_id}/cancel")
     assert set(batches.states(job_id)) == {"cancelled"}
     batches.service.json("POST", f"/jobs/{job_id}/retry")

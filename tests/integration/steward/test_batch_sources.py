@@ -74,7 +74,7 @@ def test_a_prefix_without_photos_fails_and_says_so(batches: Batches) -> None:
 def test_a_prefix_with_too_many_photos_brings_in_none(batches: Batches) -> None:
     for number in range(3):
         batches.store.put(f"imports/{number}.jpg", photo_bytes(number))
-    job = batches.finish(batches.start(prefix="imports"), batches.new_worker(max_batch_photos=2))
+    job = batches.finish(batches.start(prefix="imports"), batches.new_worker(max_queued_jobs=4))
     assert (job["state"], job["error"]["code"]) == ("failed", "too_many_photos")
     assert batches.photos() == []
 
@@ -201,7 +201,7 @@ def test_limits_of_a_batch_are_reported_and_leave_nothing(
     settings: Settings,
     make_worker: Callable[[], ExtractorWorker],
 ) -> None:
-    small = settings.model_copy(update={"max_batch_photos": 2})
+    small = settings.model_copy(update={"max_queued_jobs": 4})
     with catalog.write() as session:
         get_or_create_default_map(session, settings.extractor)
     service = Service(catalog, store, small, make_worker)
