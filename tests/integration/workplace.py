@@ -34,7 +34,7 @@ from shared.descriptors.vocabulary import ClusterCentres
 from shared.extractor_config.configs import get_extractor_config
 from shared.imaging.decode import decode_photo
 from shared.imaging.preprocessing import Pixels, get_preprocessing
-from shared.jobs import InProcessWakeups, Job, JobKind, JobState, reclaim_expired_leases
+from shared.jobs import InProcessWakeups, Job, JobKind, JobState
 from shared.jobs.model_changes import cancel_model_change, start_model_change
 from shared.storage import FolderStore
 from shared.storage.chunks import Rows
@@ -43,7 +43,6 @@ from tests.support.catalog_rows import (
     ask,
     delete,
     read_job,
-    set_columns,
     stored_rows,
     upload,
 )
