@@ -374,11 +374,7 @@ def _parse_address(address: str) -> IPv4Address | IPv6Address | None:
 
 
 def _raise_file_limit() -> int:
-    """Raise the soft limit of open files to the hard limit, at most MAX_OPEN_FILES.
-
-    Returns:
-        The limit that is in effect.
-    """
+    """Raise the soft limit of open files to the hard limit, at most MAX_OPEN_FILES; return it."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     target = MAX_OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_OPEN_FILES)
     if soft == resource.RLIM_INFINITY or soft >= target:

@@ -169,12 +169,7 @@ def describe(
 
 
 def _hdf5_names(photos: Sequence[Path], out: Path, root: Path | None) -> list[str] | None:
-    """The names of the photos in an .h5 file; None for an .npy file.
-
-    Raises:
-        InvalidRequest: `options_contradict`; `bad_names` for photos outside `root` and duplicates.
-        Misconfigured: `lab_missing` if h5py is not installed.
-    """
+    """The names of the photos in an .h5 file; None for an .npy file."""
     if out.suffix not in (".h5", ".hdf5"):
         if root is not None:
             raise InvalidRequest("options_contradict", "--root requires --out FILE.h5.")

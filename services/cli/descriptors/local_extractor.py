@@ -64,11 +64,7 @@ def load_extractor(config: ExtractorConfig, settings: Settings) -> Extractor:
 def _added_backbone(
     config: ExtractorConfig, settings: Settings, device: torch.device
 ) -> Backbone | None:
-    """Load an added model from the catalog and store of the settings, which may be in use.
-
-    Returns None for an extractor that is not an added model. Raises Misconfigured (`model_missing`)
-    and the errors of the catalog, the store and `AddedModelLoader.load`.
-    """
+    """Load an added model from the catalog and store, which may be in use; None for others."""
     name = config.trained.registered if config.trained else None
     if name is None:
         return None
@@ -102,14 +98,7 @@ def _decode_batches(
     settings: Settings,
     seconds: defaultdict[str, float],
 ) -> Iterator[list[tuple[Path, DecodeOutcome]]]:
-    """Decode photos in batches; the next batch is prefetched in the background.
-
-    The decoding time is added to `seconds["decode"]`.
-
-    Yields:
-        Batches in the order of `photos`: each photo with its pixels, or the error of a photo that
-        can't be read or decoded.
-    """
+    """Decode photos in batches, the next one in the background; adds to `seconds["decode"]`."""
     decoders = DecoderPool(settings)
 
     def read(begin: int) -> list[tuple[Path, DecodeOutcome]]:

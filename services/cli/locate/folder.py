@@ -60,11 +60,7 @@ def _in_range(time: datetime | None, change: Callable[[datetime], datetime]) -> 
 
 
 def _parse_time_zone(text: str) -> tzinfo:
-    """Parse an offset such as `+02:00`, `UTC` or a name of the time zone database.
-
-    Raises:
-        InvalidRequest: `bad_time_zone`.
-    """
+    """Parse an offset such as `+02:00`, `UTC` or a name of the time zone database."""
     with contextlib.suppress(ValueError):
         offset = datetime.fromisoformat(f"2000-01-01T00:00:00{text}").utcoffset()
         if offset is not None:

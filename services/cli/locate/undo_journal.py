@@ -240,11 +240,7 @@ def _link_or_copy(source: Path, target: Path) -> None:
 
 
 def _copy_ownership(source: Path, target: Path) -> None:
-    """Give a file the owner, group, mode and extended attributes (so the ACL) of another one.
-
-    Raises:
-        Unprocessable: `owner_differs`.
-    """
+    """Give a file the owner, group, mode and extended attributes (so the ACL) of another one."""
     info, new = source.stat(), target.stat()
     if (info.st_uid, info.st_gid) != (new.st_uid, new.st_gid):
         try:

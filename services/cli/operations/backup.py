@@ -81,13 +81,7 @@ def open_storage(settings: Settings, command: str) -> Iterator[tuple[Catalog, Ow
 
 @contextlib.contextmanager
 def _open_new_catalog(settings: Settings, command: str) -> Iterator[tuple[Catalog, OwnedStore]]:
-    """Open the catalog, with its tables created, and a store that may not be its own yet.
-
-    Afterwards the store belongs to it.
-
-    Raises:
-        PlacewiseError: As `lock_home`, `migrate` and `open_store` raise it.
-    """
+    """Open the catalog, with its tables created, and a store that may not be its own yet."""
     exclusive = settings.database_url is None
     with contextlib.ExitStack() as stack:
         if exclusive:

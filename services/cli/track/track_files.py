@@ -167,17 +167,7 @@ def _plain(value: Any) -> Any:
 
 
 def _draw_track(track: OneTrack, photos: Sequence[Photo], *, image_format: str) -> bytes:
-    """Draw a track.
-
-    Args:
-        track: The track. Its frames are drawn by their positions if any has one, otherwise by their
-            places.
-        photos: The photos of the map.
-        image_format: `png` or `jpeg`.
-
-    Returns:
-        The bytes of the picture.
-    """
+    """Draw the frames by their positions if any has one, otherwise by their places."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=INCHES, dpi=DPI, layout="constrained")

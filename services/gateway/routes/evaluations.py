@@ -113,11 +113,7 @@ def _new_evaluation_job(
     kind: JobKind,
     params: dict[str, Any],
 ) -> Job:
-    """Create a job that queries the generation with the map's own photos.
-
-    Raises:
-        Conflict: `nothing_to_evaluate`, if no described photo has a place.
-    """
+    """Create a job that queries the generation with the map's own photos."""
     if generation is None or not has_geotagged(session, generation.id, PhotoRole.DATABASE):
         raise Conflict(
             "nothing_to_evaluate",

@@ -124,8 +124,7 @@ class _BatchItemImporter:
             self._store.delete(key)
 
     def _reserve_quota(self, job: Job, key_id: UUID | None) -> AbstractContextManager[None]:
-        """Reserve a photo in the quota of the batch's API key; raises TooManyRequests
-        (`photo_quota_reached`)."""
+        """Reserve a photo in the quota of the batch's API key."""
         if key_id is None or job.params["max_photos"] is None:
             return contextlib.nullcontext()
         return self._quota.reserve(key_id, job.params["max_photos"])

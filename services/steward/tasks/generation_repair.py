@@ -63,8 +63,7 @@ def repair_generations(catalog: Catalog, store: ObjectStore) -> None:
 
 
 def _read_error(store: ObjectStore, chunk: Chunk) -> PlacewiseError | None:
-    """Return the error of a damaged or missing chunk; None if it is readable or the store is
-    unavailable."""
+    """Return the error of a damaged or missing chunk; None if another or no error occurs."""
     try:
         read_chunk(store, chunk.object_key, chunk.sha256)
     except NotFound as error:
