@@ -1,6 +1,6 @@
 """Generates the vocabularies that are shipped with the extractors of EfficientNet-Lite0:
 
-    python -m tools.make_shipped_vocabulary
+    python -m lab.benchmarks.shipped_vocabulary
 
 They are fitted on photographs contained in installed packages (scikit-learn, scikit-image), cut
 into overlapping views at several scales. Since they are not fitted on a map's own photos, searches
@@ -86,7 +86,7 @@ def _write_vocabulary(config: ExtractorConfig) -> None:
         "iterations": iterations,
         "views": len(views),
         "patches": len(points),
-        "made_by": "python -m tools.make_shipped_vocabulary",
+        "made_by": "python -m lab.benchmarks.shipped_vocabulary",
         "photographs": {
             PACKAGES[package]: {
                 "version": version(PACKAGES[package]),
