@@ -16,6 +16,7 @@ import threading
 import time
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from pathlib import PurePosixPath
 from typing import Any
 from uuid import UUID
 
@@ -23,7 +24,6 @@ from prometheus_client import CollectorRegistry
 from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
 
-from services.steward.batches.listing import list_prefix_photos
 from services.steward.metrics import StewardMetrics
 from services.steward.periodic_tasks import periodic_task
 from shared.catalog.batch_items import (
@@ -43,8 +43,15 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import UNFINISHED_STATES, WaitingFor, claimable_condition
 from shared.config.disk_space import DiskSpace
 from shared.config.settings import Settings
-from shared.errors import InvalidRequest, PlacewiseError, StorageFull, Unavailable
-from shared.imaging.file_formats import PHOTO_SIGNATURE_BYTES, photo_suffix
+from shared.errors import (
+    InvalidRequest,
+    PlacewiseError,
+    StorageFull,
+    TooLarge,
+    Unavailable,
+    Unprocessable,
+)
+from shared.imaging.file_formats import PHOTO_SIGNATURE_BYTES, PHOTO_SUFFIXES, photo_suffix
 from shared.ingest.photo_metadata import parse_relative_path
 from shared.ingest.store_photo import PhotoQuota, StoreResult, insert_photo
 from shared.ingest.validation import (
@@ -66,6 +73,7 @@ from shared.jobs.transitions import (
 )
 from shared.storage import ObjectStore
 from shared.storage.keys import IMPORTS, new_original_key
+from shared.utm_filenames import upload_fields_of_file_name
 
 log = logging.getLogger(__name__)
 
@@ -295,13 +303,13 @@ class BatchWorker:
             if leased := lock_leased_job(session, job):
                 leased.stage = "list"
         max_photos = self._settings.max_batch_photos
-        listing = list_prefix_photos(self._store, job.params["prefix"], max_photos)
+        items, ignored = _list_prefix_photos(self._store, job.params["prefix"], max_photos)
         with self._catalog.write() as session:
             leased = lock_leased_job(session, job)
             if leased is None:
                 raise JobInterrupted
-            leased.params = {**leased.params, "ignored": listing.ignored}
-            add_batch_items(session, leased, listing.items)
+            leased.params = {**leased.params, "ignored": ignored}
+            add_batch_items(session, leased, items)
 
     def _fail_suspect_item(self, job: Job) -> None:
         """Fail the next item: several workers died on it, since no photo was imported meanwhile."""
@@ -354,3 +362,35 @@ class BatchWorker:
             return PROGRESS_POLL_SECONDS
         other = select(Job.id).where(claimable_condition((JobKind.BATCH,)), Job.id != job.id)
         return YIELD_SECONDS if session.scalar(select(exists(other))) else 0.0
+
+
+def _list_prefix_photos(
+    store: ObjectStore, prefix: str, max_photos: int
+) -> tuple[list[dict[str, Any]], int]:
+    """List the photos under a prefix by key, as columns of BatchItem, and count other objects."""
+    keys: list[str] = []
+    ignored = 0
+    for info in store.list(prefix):
+        path = PurePosixPath(info.key.removeprefix(prefix))
+        hidden = any(part.startswith(".") for part in path.parts)
+        if hidden or path.suffix.lower() not in PHOTO_SUFFIXES:
+            ignored += 1
+            continue
+        keys.append(info.key)
+        if len(keys) > max_photos:
+            raise TooLarge(
+                "too_many_photos",
+                f"There are more than {max_photos} photos under {prefix} (half of "
+                "MAX_QUEUED_JOBS). Use a longer prefix.",
+            )
+    if not keys:
+        raise Unprocessable("no_photos", f"The object store has no photos under {prefix}.")
+    return [_object_item(key) for key in sorted(keys)], ignored
+
+
+def _object_item(key: str) -> dict[str, Any]:
+    item: dict[str, Any] = {"name": key, "object_key": key}
+    try:
+        return {**item, "fields": upload_fields_of_file_name(PurePosixPath(key).name, None)}
+    except PlacewiseError as error:
+        return {**item, "state": JobState.FAILED, "error": error.as_problem()}
