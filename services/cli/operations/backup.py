@@ -42,7 +42,7 @@ from shared.storage.open_store import open_store
 from shared.storage.ownership import read_owner
 
 if TYPE_CHECKING:
-    from services.cli.recovery.rebuild import RecoveryReport
+    from services.cli.recovery.journal_rows import RecoveryReport
 
 MAX_KEYS_SHOWN = 10
 

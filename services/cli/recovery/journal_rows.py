@@ -70,8 +70,8 @@ WHERE excluded.revision > states.revision
 
 
 @dataclass(slots=True)
-class RecoveredRows:
-    """Counts of the recovered rows."""
+class RecoveryReport:
+    """What was recovered, and what could not be."""
 
     maps: int = 0
     renamed_maps: dict[str, str] = field(default_factory=dict)
@@ -85,6 +85,18 @@ class RecoveredRows:
     vocabularies: int = 0
     damaged_segments: list[str] = field(default_factory=list)
     """Keys of unreadable segments, with the reasons."""
+    chunks: int = 0
+    descriptors: int = 0
+    damaged_chunks: list[str] = field(default_factory=list)
+    """Keys of chunks that contradict their manifests."""
+    unnamed_photos: int = 0
+    """Photos that are not in the journal: added to the default map with their EXIF data."""
+    unreadable_originals: list[str] = field(default_factory=list)
+    """Keys of originals that are not valid photos."""
+    unnamed_descriptors: int = 0
+    """Rows of chunks whose generations are not in the journal."""
+    queued_photos: int = 0
+    """Photos without a descriptor, which were queued."""
 
 
 class LatestStates:
@@ -222,7 +234,7 @@ def recover_rows(
     catalog: Catalog,
     store: ObjectStore,
     states: LatestStates,
-    recovered: RecoveredRows,
+    recovered: RecoveryReport,
     progress: Progress,
 ) -> None:
     """Insert the rows of the tables in `TABLES`; those that the catalog has already stay."""
@@ -260,7 +272,7 @@ class _RowPreparation:
     The journal is consistent, except for its last seconds and for damaged segments.
     """
 
-    def __init__(self, store: ObjectStore, states: LatestStates, recovered: RecoveredRows) -> None:
+    def __init__(self, store: ObjectStore, states: LatestStates, recovered: RecoveryReport) -> None:
         self._store = store
         self._states = states
         self._recovered = recovered

@@ -7,14 +7,13 @@ damaged.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from uuid import UUID
 
 from sqlalchemy import insert, select, update
 from sqlalchemy.orm import Session
 
-from services.cli.recovery.journal_rows import ROWS_PER_STATEMENT, Progress
+from services.cli.recovery.journal_rows import ROWS_PER_STATEMENT, Progress, RecoveryReport
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk, Descriptor, allocate_slot
 from shared.catalog.database.session import Catalog
@@ -32,28 +31,19 @@ from shared.storage.keys import ORIGINALS
 CHUNKS = "chunks/"
 
 
-@dataclass(slots=True)
-class RecoveredChunks:
-    """Counts of the recovered chunks."""
-
-    chunks: int = 0
-    descriptors: int = 0
-    damaged: list[str] = field(default_factory=list)
-    """Keys of chunks that contradict their manifests."""
-    unnamed_rows: int = 0
-    """Rows of chunks whose generations are not in the catalog."""
-
-
 def recover_chunks(
-    catalog: Catalog, store: ObjectStore, slot_rows: int, progress: Progress
-) -> RecoveredChunks:
+    catalog: Catalog,
+    store: ObjectStore,
+    slot_rows: int,
+    recovered: RecoveryReport,
+    progress: Progress,
+) -> None:
     """Register the chunks with rows of photos that lack a descriptor in their generation.
 
     Only active generations and those being built. Newest chunks first: compaction writes a new
     chunk with the same rows as the older ones. Every chunk is verified against the hash in its
     manifest.
     """
-    recovered = RecoveredChunks()
     with catalog.read() as session:
         states = {
             row.id: row.state for row in session.execute(select(Generation.id, Generation.state))
@@ -69,13 +59,12 @@ def recover_chunks(
         except NotFound:
             manifest = None
         if manifest is None:
-            recovered.damaged.append(key)
+            recovered.damaged_chunks.append(key)
         elif manifest.generation_id not in states:
-            recovered.unnamed_rows += len(manifest.photo_ids)
+            recovered.unnamed_descriptors += len(manifest.photo_ids)
         elif states[manifest.generation_id] in (GenerationState.ACTIVE, GenerationState.BUILDING):
             _recover_chunk(catalog, store, key, manifest, slot_rows, recovered)
         progress("chunks", done, len(keys))
-    return recovered
 
 
 def _recover_chunk(
@@ -84,7 +73,7 @@ def _recover_chunk(
     key: str,
     manifest: ChunkManifest,
     slot_rows: int,
-    recovered: RecoveredChunks,
+    recovered: RecoveryReport,
 ) -> None:
     with catalog.read() as session:
         missing = _missing_descriptors(session, manifest)
@@ -93,7 +82,7 @@ def _recover_chunk(
     data = store.get(key)
     rows = decode_rows(data) if hashlib.sha256(data).hexdigest() == manifest.sha256 else None
     if rows is None or len(rows) != len(manifest.photo_ids) or not rows_are_valid(rows).all():
-        recovered.damaged.append(key)
+        recovered.damaged_chunks.append(key)
         return
     with catalog.write() as session:
         generation = session.get_one(Generation, manifest.generation_id)
@@ -142,22 +131,14 @@ def _missing_descriptors(session: Session, manifest: ChunkManifest) -> dict[UUID
     return {photo_id: row for photo_id, row in rows.items() if photo_id in missing}
 
 
-@dataclass(slots=True)
-class RecoveredOriginals:
-    """Counts of the recovered originals."""
-
-    photos: int = 0
-    unreadable: list[str] = field(default_factory=list)
-    """Keys of originals that are not valid photos."""
-
-
 def recover_originals(
     catalog: Catalog,
     store: ObjectStore,
     settings: Settings,
     unnamed: list[tuple[str, float]],
+    recovered: RecoveryReport,
     progress: Progress,
-) -> RecoveredOriginals:
+) -> None:
     """Add originals that no row references to the default map, with their EXIF data.
 
     They are stored like uploads. Originals with the bytes of a live photo are skipped.
@@ -166,7 +147,6 @@ def recover_originals(
         settings: limits and the extractor of new maps.
         unnamed: key and time (seconds since 1970) of the originals.
     """
-    recovered = RecoveredOriginals()
     for done, (key, modified_at) in enumerate(unnamed, start=1):
         progress("originals that are not in the journal", done, len(unnamed))
         with catalog.read() as session:
@@ -181,11 +161,10 @@ def recover_originals(
         except Unavailable:
             raise
         except PlacewiseError:
-            recovered.unreadable.append(key)
+            recovered.unreadable_originals.append(key)
             continue
         uploaded_at = datetime.fromtimestamp(modified_at, UTC)
-        recovered.photos += _store(catalog, settings, incoming, uploaded_at)
-    return recovered
+        recovered.unnamed_photos += _store(catalog, settings, incoming, uploaded_at)
 
 
 def _store(

@@ -6,7 +6,6 @@ repeated. Until it has finished, nothing else uses the catalog (`check_not_behin
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from uuid import UUID
 
 from sqlalchemy import delete, exists, insert, select, update
@@ -16,7 +15,7 @@ from services.cli.recovery.journal_rows import (
     ROWS_PER_STATEMENT,
     LatestStates,
     Progress,
-    RecoveredRows,
+    RecoveryReport,
     recover_rows,
     recover_snapshot,
 )
@@ -50,22 +49,6 @@ TABLES_WITH_INITIAL_ROWS = {
         *(RegisteredProcess, RegisteredSearchWorker),
     )
 }
-
-
-@dataclass(slots=True)
-class RecoveryReport(RecoveredRows):
-    """What was recovered, and what could not be."""
-
-    chunks: int = 0
-    descriptors: int = 0
-    damaged_chunks: list[str] = field(default_factory=list)
-    unnamed_photos: int = 0
-    """Photos that are not in the journal: added to the default map with their EXIF data."""
-    unreadable_originals: list[str] = field(default_factory=list)
-    unnamed_descriptors: int = 0
-    """Rows of chunks whose generations are not in the journal."""
-    queued_photos: int = 0
-    """Photos without a descriptor, which were queued."""
 
 
 def begin_rebuild(catalog: Catalog, store: OwnedStore, installation_id: UUID | None) -> None:
@@ -126,17 +109,12 @@ def rebuild_catalog(
     with LatestStates() as states:
         states.read(store, progress)
         recover_rows(catalog, store, states, report, progress)
-        chunks = recover_chunks(catalog, store, settings.slot_rows, progress)
-        report.chunks, report.descriptors = chunks.chunks, chunks.descriptors
-        report.damaged_chunks, report.unnamed_descriptors = chunks.damaged, chunks.unnamed_rows
+        recover_chunks(catalog, store, settings.slot_rows, report, progress)
         recover_snapshot(catalog, store, states, progress)
         if with_unnamed:
-            originals = recover_originals(
-                catalog, store, settings, states.unnamed_originals(), progress
-            )
-            report.unnamed_photos = report.queued_photos = originals.photos
-            report.unreadable_originals = originals.unreadable
-        report.queued_photos += _queue_photos(catalog, progress)
+            unnamed = states.unnamed_originals()
+            recover_originals(catalog, store, settings, unnamed, report, progress)
+        report.queued_photos = report.unnamed_photos + _queue_photos(catalog, progress)
         with catalog.write() as session:
             get_or_create_installation(session).journal_sequence = states.sequence
     return report

@@ -17,7 +17,8 @@ from services.cli.recovery.backup import (
     BackupProgress,
     list_backup_objects,
 )
-from services.cli.recovery.rebuild import RecoveryReport, begin_rebuild, rebuild_catalog
+from services.cli.recovery.journal_rows import RecoveryReport
+from services.cli.recovery.rebuild import begin_rebuild, rebuild_catalog
 from shared.catalog.database.session import Catalog
 from shared.catalog.installation import Installation
 from shared.config.settings import Settings

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from sqlalchemy import delete, func, select
 
-from services.cli.recovery.rebuild import RecoveryReport, begin_rebuild, rebuild_catalog
+from services.cli.recovery.journal_rows import RecoveryReport
+from services.cli.recovery.rebuild import begin_rebuild, rebuild_catalog
 from services.steward.tasks import garbage_collection
 from services.steward.tasks.compaction import merge_small_chunks
 from services.steward.tasks.delete_maps import purge_deleted_maps
