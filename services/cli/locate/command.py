@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -28,7 +28,7 @@ from services.cli.locate.preview import (
     write_preview,
 )
 from services.cli.locate.undo_journal import UndoReport, undo
-from services.cli.locate.writers import Location, Target, WriteReport, write_locations
+from services.cli.locate.writers import LocatedPhoto, Target, WriteReport, write_locations
 from services.cli.output import (
     Json,
     JsonOption,
@@ -56,38 +56,12 @@ from shared.geotagging.evidence import (
     TimeNeighbours,
     interpolate_position,
 )
-from shared.geotagging.fusion import Proposal, propose_position
+from shared.geotagging.fusion import propose_position
 from shared.tracks.motion import MOTION_MODELS, MotionModel, parse_motion
 
 SIMILAR_PHOTOS = 50
 SEARCHES_AT_ONCE = 4
 WITH_COORDINATES = "-90,-180,90,180"  # a box that contains all photos that have some
-
-
-@dataclass(frozen=True, slots=True)
-class _LocatedPhoto:
-    """The proposal for a photo without coordinates."""
-
-    photo: FolderPhoto
-    proposal: Proposal | None
-    place: str | None
-    """finest label of the estimate"""
-    place_probability: float | None
-    error: str | None
-    """why the photo could not be searched"""
-
-    @property
-    def probability(self) -> float:
-        """Of the position, or of the place if there is none."""
-        if self.proposal is not None:
-            return self.proposal.probability
-        return self.place_probability or 0.0
-
-    def shown(self) -> list[float | str]:
-        """Return coordinates and place, as far as they are known, rounded as they are shown."""
-        found = self.proposal
-        coordinates = [round(found.latitude, 6), round(found.longitude, 6)] if found else []
-        return [*coordinates, *([self.place] if self.place else [])]
 
 
 def locate(
@@ -199,9 +173,12 @@ def locate(
     accepted = [each for each in located if each.probability >= accept_from]
     written = None
     if write is not None:
-        written = write_locations(
-            folder, write, [_location(each, accept_from) for each in accepted]
-        )
+        # A place is written only if it is accepted, too.
+        located_surely = [
+            each if (each.place_probability or 0.0) >= accept_from else replace(each, place=None)
+            for each in accepted
+        ]
+        written = write_locations(folder, write, located_surely)
     if as_json:
         print_json(_to_json(photos, located, accept, written))
     else:
@@ -257,12 +234,12 @@ def _locate_photo(
     track: Sequence[KnownPosition],
     moves: MotionModel,
     radius_m: float,
-) -> _LocatedPhoto:
+) -> LocatedPhoto:
     speed = moves.max_speed_mps
     on_track = None if photo.time is None else interpolate_position(track, photo.time, speed)
     searched = searched or SearchedPhoto()
     by_time = neighbours.position_of(photo, speed)
-    return _LocatedPhoto(
+    return LocatedPhoto(
         photo,
         propose_position(searched.evidence, by_time, on_track, radius_m),
         searched.place,
@@ -302,7 +279,7 @@ def picture_evidence(answer: Similar, photo_count: int) -> PictureEvidence:
     )
 
 
-def _print_changes(preview: Preview, accepted: Sequence[_LocatedPhoto]) -> None:
+def _print_changes(preview: Preview, accepted: Sequence[LocatedPhoto]) -> None:
     """Say of which preview the written proposals are, and which of them it did not show so."""
     shown = preview.accepted
     present = {each.photo.name: each.shown() for each in accepted}
@@ -320,21 +297,9 @@ def _print_changes(preview: Preview, accepted: Sequence[_LocatedPhoto]) -> None:
     )
 
 
-def _location(located: _LocatedPhoto, accept: float) -> Location:
-    """Return what is written of an accepted proposal: its place only if that is accepted, too."""
-    photo = located.photo
-    return Location(
-        photo.path,
-        photo.name,
-        photo.time if photo.time_zone_is_known else None,
-        located.proposal,
-        located.place if (located.place_probability or 0.0) >= accept else None,
-    )
-
-
 def _to_json(
     photos: Sequence[FolderPhoto],
-    located: Sequence[_LocatedPhoto],
+    located: Sequence[LocatedPhoto],
     accept: float,
     written: WriteReport | None,
 ) -> Json:
@@ -362,8 +327,8 @@ def _to_json(
 def _print_proposals(
     folder: Path,
     photos: Sequence[FolderPhoto],
-    located: Sequence[_LocatedPhoto],
-    accepted: Sequence[_LocatedPhoto],
+    located: Sequence[LocatedPhoto],
+    accepted: Sequence[LocatedPhoto],
     accept: float,
     written: WriteReport | None,
 ) -> None:

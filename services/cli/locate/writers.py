@@ -13,13 +13,12 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
 from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
 from xml.etree import ElementTree
 
-from services.cli.locate.folder import read_photo
+from services.cli.locate.folder import FolderPhoto, read_photo
 from services.cli.locate.sidecars import METHOD, add_position, find_sidecar, sidecar_path
 from services.cli.locate.undo_journal import UndoJournal, open_journal
 from services.cli.output import utf8_path
@@ -41,16 +40,29 @@ class Target(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Location:
-    """An accepted proposal: coordinates, or the label of a place, or both."""
+class LocatedPhoto:
+    """The proposal for a photo without coordinates."""
 
-    path: Path
-    name: str
-    """relative to the folder"""
-    time: datetime | None
-    """UTC; None if it or its zone is unknown"""
+    photo: FolderPhoto
     proposal: Proposal | None
     place: str | None
+    """finest label of the estimate"""
+    place_probability: float | None
+    error: str | None
+    """why the photo could not be searched"""
+
+    @property
+    def probability(self) -> float:
+        """Of the position, or of the place if there is none."""
+        if self.proposal is not None:
+            return self.proposal.probability
+        return self.place_probability or 0.0
+
+    def shown(self) -> list[float | str]:
+        """Return coordinates and place, as far as they are known, rounded as they are shown."""
+        found = self.proposal
+        coordinates = [round(found.latitude, 6), round(found.longitude, 6)] if found else []
+        return [*coordinates, *([self.place] if self.place else [])]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +74,7 @@ class WriteReport:
     """reasons by photo"""
 
 
-def write_locations(folder: Path, target: Target, locations: Sequence[Location]) -> WriteReport:
+def write_locations(folder: Path, target: Target, locations: Sequence[LocatedPhoto]) -> WriteReport:
     """Write proposals, with a journal that undoes it.
 
     Args:
@@ -75,7 +87,7 @@ def write_locations(folder: Path, target: Target, locations: Sequence[Location])
     report = WriteReport()
     positions = [(each, each.proposal) for each in locations if each.proposal is not None]
     if target != Target.CSV:
-        missing = [each.name for each in locations if each.proposal is None]
+        missing = [each.photo.name for each in locations if each.proposal is None]
         report.skipped.update(dict.fromkeys(missing, "has a place only, which --write csv writes"))
     write_one = _photo_writer(target)
     with open_journal(folder) as journal:
@@ -89,17 +101,18 @@ def write_locations(folder: Path, target: Target, locations: Sequence[Location])
             report.written.append(name)
         else:
             for location, proposal in positions:
-                if reason := _change_meanwhile(folder, location.path):
-                    report.skipped[location.name] = reason
+                name = location.photo.name
+                if reason := _change_meanwhile(folder, location.photo.path):
+                    report.skipped[name] = reason
                     continue
                 try:
-                    path = write_one(journal, location.path, proposal)
+                    path = write_one(journal, location.photo.path, proposal)
                 except PlacewiseError as error:
-                    report.skipped[location.name] = error.detail
+                    report.skipped[name] = error.detail
                 except OSError as error:
                     if error.errno not in ERRORS_OF_ONE_FILE:
                         raise
-                    report.skipped[location.name] = f"can't be written: {error.strerror}"
+                    report.skipped[name] = f"can't be written: {error.strerror}"
                 else:
                     report.written.append(utf8_path(path.relative_to(folder)))
     return report
@@ -144,29 +157,29 @@ def _write_sidecar(journal: UndoJournal, photo: Path, proposal: Proposal) -> Pat
     return path
 
 
-def _to_csv(locations: Sequence[Location]) -> bytes:
+def _to_csv(locations: Sequence[LocatedPhoto]) -> bytes:
     """Return a table that `placewise index --csv` reads."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("filename", "latitude", "longitude", "place"))
     for each in locations:
         position = (each.proposal.latitude, each.proposal.longitude) if each.proposal else ("", "")
-        texts = escape_csv_text(each.name), escape_csv_text(each.place or "")
+        texts = escape_csv_text(each.photo.name), escape_csv_text(each.place or "")
         writer.writerow((texts[0], *position, texts[1]))
     return text.getvalue().encode()
 
 
-def _to_gpx(positions: Sequence[tuple[Location, Proposal]]) -> bytes:
+def _to_gpx(positions: Sequence[tuple[LocatedPhoto, Proposal]]) -> bytes:
     root = ElementTree.Element(
         "gpx", {"xmlns": GPX_NAMESPACE, "version": "1.1", "creator": "Placewise"}
     )
     for location, proposal in positions:
         degrees = {"lat": f"{proposal.latitude:.7f}", "lon": f"{proposal.longitude:.7f}"}
         point = ElementTree.SubElement(root, "wpt", degrees)
-        if location.time is not None:
-            time = location.time.isoformat().replace("+00:00", "Z")
+        if location.photo.time is not None and location.photo.time_zone_is_known:
+            time = location.photo.time.isoformat().replace("+00:00", "Z")
             ElementTree.SubElement(point, "time").text = time
-        ElementTree.SubElement(point, "name").text = location.name
+        ElementTree.SubElement(point, "name").text = location.photo.name
         ElementTree.SubElement(point, "desc").text = (
             f"{100 * proposal.probability:.1f} % within {proposal.radius_m:.0f} m: "
             f"{proposal.reason}"
