@@ -26,7 +26,11 @@ IDS_PER_QUERY = 1000  # maximum of photo ids in one statement
 
 
 class Chunk(Base):
-    """An immutable `.npy` file of `rows` float32 descriptors, with its SHA-256."""
+    """An immutable `.npy` file of `rows` descriptors, with its SHA-256.
+
+    The columns `features_*` describe its feature file: the model of the local features (null: there
+    is none), the number of rows that have some, its size and its SHA-256.
+    """
 
     __tablename__ = "chunks"
 
@@ -39,6 +43,10 @@ class Chunk(Base):
     rows: Mapped[int] = mapped_column(sa.Integer)
     size_bytes: Mapped[int] = mapped_column(sa.BigInteger)
     sha256: Mapped[str] = mapped_column(sa.String(64))
+    features_model: Mapped[str | None] = mapped_column(sa.String(100))
+    features_rows: Mapped[int] = mapped_column(sa.Integer, default=0, server_default="0")
+    features_bytes: Mapped[int] = mapped_column(sa.BigInteger, default=0, server_default="0")
+    features_sha256: Mapped[str | None] = mapped_column(sa.String(64))
     # Whether compaction wrote it.
     sealed: Mapped[bool] = mapped_column(sa.Boolean, default=False)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())

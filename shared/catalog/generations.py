@@ -70,6 +70,8 @@ class Generation(Journaled, Base):
     whitening_id: Mapped[UUID | None] = mapped_column(Uuid, ForeignKey("whitenings.id"), index=True)
     calibration: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
     word_weights: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
+    uses_matches: Mapped[bool | None] = mapped_column(Boolean)
+    """Whether local features improve its answers; null until an evaluation has decided it."""
     open_slot: Mapped[int] = mapped_column(Integer, default=0)
     open_slot_rows: Mapped[int] = mapped_column(Integer, default=0)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())

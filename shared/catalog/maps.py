@@ -14,6 +14,7 @@ import time
 from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from datetime import datetime
+from enum import StrEnum
 from typing import Any
 from uuid import UUID
 
@@ -56,6 +57,14 @@ MAP_NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 DELETED_NAME_PREFIX = "deleted/"  # valid names of maps have no slash
 
 
+class Matching(StrEnum):
+    """Whether local features of a map's photos are computed and matched."""
+
+    AUTO = "auto"  # until an evaluation has shown that they do not improve the answers
+    ON = "on"
+    OFF = "off"
+
+
 class Map(Journaled, Base):
     """A map. Every transaction that changes its search results increments `version`."""
 
@@ -81,6 +90,9 @@ class Map(Journaled, Base):
     """Whether the steward fits vocabularies for it."""
     fitted_photos: Mapped[int | None] = mapped_column(sa.Integer)
     """Number of its database photos when the last fit of its extractor's vocabulary was started."""
+    matching: Mapped[Matching] = mapped_column(
+        sa.String(20), default=Matching.AUTO, server_default=Matching.AUTO
+    )
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 

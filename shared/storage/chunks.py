@@ -1,4 +1,4 @@
-"""Chunk files: descriptor rows as an immutable `.npy` file, with a manifest and sign codes.
+"""Chunk files: descriptor rows as an immutable `.npy` file, with the files that belong to them.
 
 `<chunk>.npy` is a C-contiguous (rows, dimension) array, float32 or float16, each row L2-normalised
 before it was rounded to that type.
@@ -6,6 +6,7 @@ before it was rounded to that type.
 that a lost catalog can be rebuilt from the object store.
 `<chunk>.codes` has the sign codes that search scans first (`shared.codes`), for chunks that are
 large enough.
+`<chunk>.features` has the local features of the photos (`shared.storage.feature_files`), if any.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import json
 import mmap
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, BinaryIO
 from uuid import UUID
 
@@ -25,6 +26,8 @@ from numpy.typing import NDArray
 
 from shared.errors import Unavailable
 from shared.storage import ObjectStore
+from shared.storage.feature_files import FeatureRows, encode_feature_file
+from shared.storage.protocol import read_up_to
 
 Rows = NDArray[np.float32]
 Row = NDArray[np.float32]
@@ -57,6 +60,12 @@ class WrittenChunk:
     rows: int
     size_bytes: int
     sha256: str
+    features_model: str | None = None
+    """`Detector.model` of the local features; None without a feature file"""
+    features_rows: int = 0
+    """rows with local features"""
+    features_bytes: int = 0
+    features_sha256: str | None = None
 
 
 def chunk_key(generation_id: UUID, chunk_id: UUID) -> str:
@@ -124,23 +133,26 @@ def write_chunk(
     rows: StoredRows,
     photo_ids: list[UUID],
     spec: dict[str, Any],
+    features: FeatureRows | None = None,
 ) -> WrittenChunk:
-    """Write a chunk, its manifest and, if it is large enough, its sign codes to the store.
+    """Write a chunk with its manifest and the files beside it to the store.
 
-    The chunk is written last, so that it never exists without its manifest. Registering it in the
-    catalog is up to the caller.
+    The chunk is written last, so that it never exists without them. Registering it in the catalog
+    is up to the caller.
 
     Args:
         rows: (n, dimension) float32 or float16, L2-normalised.
         photo_ids: the photo of each row.
         spec: the extractor spec, part of the manifest.
+        features: the local features of the photos, row by row; no file is written if all are empty.
     """
-    if len(photo_ids) != len(rows):
+    feature_rows = features.rows if features else [b""] * len(rows)
+    if not len(photo_ids) == len(feature_rows) == len(rows):
         raise ValueError(f"{len(rows)} rows for {len(photo_ids)} photos")
     data = encode_rows(rows)
     sha256 = hashlib.sha256(data).hexdigest()
     key = chunk_key(generation_id, chunk_id)
-    manifest = {
+    manifest: dict[str, Any] = {
         "format": 1,
         "chunk_id": str(chunk_id),
         "generation_id": str(generation_id),
@@ -150,13 +162,30 @@ def write_chunk(
         "sha256": sha256,
         "photo_ids": [str(photo_id) for photo_id in photo_ids],
     }
+    written = WrittenChunk(object_key=key, rows=len(rows), size_bytes=len(data), sha256=sha256)
+    if features and any(feature_rows):
+        feature_file = encode_feature_file(features)
+        written = replace(
+            written,
+            features_model=features.model,
+            features_rows=sum(map(bool, feature_rows)),
+            features_bytes=len(feature_file),
+            features_sha256=hashlib.sha256(feature_file).hexdigest(),
+        )
+        manifest["features"] = {
+            "model": features.model,
+            "rows": written.features_rows,
+            "size_bytes": written.features_bytes,
+            "sha256": written.features_sha256,
+        }
+        store.put(features_key(key), feature_file)
     store.put(manifest_key(key), json.dumps(manifest).encode())
     if rows.shape[1] >= CODED_DIMENSION and rows.nbytes >= CODED_BYTES:
         from shared.codes.serialization import encode_sign_codes  # importing numba is slow
 
         store.put(codes_key(key), encode_sign_codes(rows, sha256))
     store.put(key, data)
-    return WrittenChunk(object_key=key, rows=len(rows), size_bytes=len(data), sha256=sha256)
+    return written
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,17 +271,9 @@ def rows_are_valid(rows: StoredRows) -> NDArray[np.bool_]:
     return np.asarray((norms == 0) | (np.abs(norms - 1) < NORM_TOLERANCE))
 
 
-def read_up_to(file: BinaryIO, size: int) -> bytes:
-    """Read `size` bytes, fewer only at the end; one read of a network stream may return less."""
-    blocks = []
-    while size and (block := file.read(size)):
-        blocks.append(block)
-        size -= len(block)
-    return b"".join(blocks)
-
-
 def delete_chunk(store: ObjectStore, object_key: str) -> None:
-    """Delete a chunk, its sign codes and its manifest."""
+    """Delete a chunk and the files beside it."""
     store.delete(object_key)
     store.delete(codes_key(object_key))
+    store.delete(features_key(object_key))
     store.delete(manifest_key(object_key))

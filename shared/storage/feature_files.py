@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.storage import ObjectStore
-from shared.storage.chunks import read_up_to
+from shared.storage.protocol import read_up_to
 
 MAGIC = b"PWF1"
 MAX_HEADER_BYTES = 4096
@@ -43,14 +43,20 @@ class FeatureIndex:
         return len(self.offsets) - 1
 
 
-def encode_feature_file(model: str, rows: Sequence[bytes]) -> bytes:
-    """Encode a feature file.
+@dataclass(frozen=True, slots=True)
+class FeatureRows:
+    """The content of a feature file."""
 
-    Args:
-        model: `Detector.model`.
-        rows: Encoded features by row; empty for photos without.
-    """
-    header = json.dumps({"format": 1, "model": model, "rows": len(rows)}).encode()
+    model: str
+    """`Detector.model`"""
+    rows: Sequence[bytes]
+    """encoded features by row; empty for photos without"""
+
+
+def encode_feature_file(features: FeatureRows) -> bytes:
+    """Encode a feature file."""
+    rows = features.rows
+    header = json.dumps({"format": 1, "model": features.model, "rows": len(rows)}).encode()
     start = _START.pack(MAGIC, len(header)) + header
     offsets = np.cumsum([len(start) + 8 * (len(rows) + 1), *map(len, rows)])
     return b"".join([start, offsets.astype("<u8").tobytes(), *rows])

@@ -133,3 +133,12 @@ class PresigningStore(OwnedStore, Protocol):
 
     def copy(self, source: str, target: str) -> None:
         """Copy the object to `target`. NotFound when `source` is missing."""
+
+
+def read_up_to(file: BinaryIO, size: int) -> bytes:
+    """Read `size` bytes, fewer only at the end; one read of a network stream may return less."""
+    blocks = []
+    while size and (block := file.read(size)):
+        blocks.append(block)
+        size -= len(block)
+    return b"".join(blocks)

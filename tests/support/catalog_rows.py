@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+from dataclasses import asdict
 from typing import Any
 from uuid import UUID
 
@@ -27,6 +28,7 @@ from shared.jobs import Job, JobKind, JobState, Priority, claim_jobs
 from shared.jobs.transitions import cancel_job
 from shared.storage import ObjectStore
 from shared.storage.chunks import Rows, StoredRows, read_chunk, write_chunk
+from shared.storage.feature_files import FeatureRows
 from shared.storage.keys import new_original_key, query_key
 
 NUMBERS = itertools.count(1)
@@ -156,6 +158,7 @@ def add_chunk(
     rows: StoredRows | None = None,
     slot: int | None = None,
     dead: int = 0,
+    features: FeatureRows | None = None,
 ) -> UUID:
     """Publish a chunk with a row for each photo, `row_of` it by default, and return its id.
 
@@ -171,6 +174,7 @@ def add_chunk(
         rows=np.stack([row_of(one) for one in photo_ids]) if rows is None else rows,
         photo_ids=photo_ids,
         spec={},
+        features=features,
     )
     with catalog.write() as session:
         generation = lock_generation(session, generation_id)
@@ -181,10 +185,7 @@ def add_chunk(
                 slot=(
                     allocate_slot(generation, len(photo_ids), slot_rows) if slot is None else slot
                 ),
-                object_key=written.object_key,
-                rows=written.rows,
-                size_bytes=written.size_bytes,
-                sha256=written.sha256,
+                **asdict(written),
             )
         )
         session.flush()

@@ -25,13 +25,16 @@ from shared.storage.chunks import (
     WrittenChunk,
     chunk_key,
     decode_rows,
+    delete_chunk,
     encode_rows,
+    features_key,
     manifest_key,
     read_chunk,
     read_row,
     rows_are_valid,
     write_chunk,
 )
+from shared.storage.feature_files import FeatureRows, read_feature_index, read_feature_rows
 
 GENERATION, CHUNK = new_id(), new_id()
 
@@ -40,7 +43,12 @@ def some_rows(count: int = 5, dimension: int = 7) -> NDArray[np.float32]:
     return np.random.default_rng(count).standard_normal((count, dimension)).astype(np.float32)
 
 
-def written(store: FolderStore, rows: NDArray[Any], photo_ids: list[UUID]) -> WrittenChunk:
+def written(
+    store: FolderStore,
+    rows: NDArray[Any],
+    photo_ids: list[UUID],
+    features: FeatureRows | None = None,
+) -> WrittenChunk:
     return write_chunk(
         store,
         generation_id=GENERATION,
@@ -48,6 +56,7 @@ def written(store: FolderStore, rows: NDArray[Any], photo_ids: list[UUID]) -> Wr
         rows=rows,
         photo_ids=photo_ids,
         spec={"extractor": "test", "dimension": rows.shape[1]},
+        features=features,
     )
 
 
@@ -150,6 +159,35 @@ def test_manifest_maps_rows_to_photos_and_is_written_before_its_chunk(
     assert manifest["chunk_id"] == str(CHUNK)
     assert (manifest["rows"], manifest["dimension"]) == (5, 7)
     assert manifest["spec"] == {"extractor": "test", "dimension": 7}
+
+
+def test_local_features_come_back_by_row_and_stand_in_the_manifest(store: FolderStore) -> None:
+    rows = some_rows(3)
+    stored = [b"first", b"", b"third"]
+    chunk = written(store, rows, [new_id() for _ in rows], FeatureRows("test@1", stored))
+    key = features_key(chunk.object_key)
+    data = store.get(key)
+    assert (chunk.features_model, chunk.features_rows) == ("test@1", 2)
+    assert chunk.features_bytes == len(data)
+    assert chunk.features_sha256 == hashlib.sha256(data).hexdigest()
+    index = read_feature_index(store, key)
+    assert (index.model, index.rows) == ("test@1", 3)
+    assert read_feature_rows(store, key, index, [2, 1, 0, 9]) == {0: b"first", 2: b"third"}
+    manifest = json.loads(store.get(manifest_key(chunk.object_key)))
+    assert manifest["features"] == {
+        "model": "test@1",
+        "rows": 2,
+        "size_bytes": len(data),
+        "sha256": chunk.features_sha256,
+    }
+    delete_chunk(store, chunk.object_key)
+    assert list(store.list("")) == []
+
+
+def test_chunk_whose_photos_have_no_local_features_has_no_file_of_them(store: FolderStore) -> None:
+    chunk = written(store, some_rows(2), [new_id(), new_id()], FeatureRows("test@1", [b"", b""]))
+    assert (chunk.features_model, chunk.features_rows, chunk.features_bytes) == (None, 0, 0)
+    assert not store.head(features_key(chunk.object_key))
 
 
 def test_every_row_needs_its_photo(store: FolderStore) -> None:
