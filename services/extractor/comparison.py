@@ -21,7 +21,7 @@ from shared.descriptors.explanation import SimilarityShares, draw_overlay, expla
 from shared.descriptors.extractor import Extractor, not_finite_error
 from shared.descriptors.inference import PhotoTooLargeForGpu
 from shared.descriptors.reranking import LocalFeatures, rerank_score
-from shared.errors import Gone, NotFound, PlacewiseError, StorageFull
+from shared.errors import Gone, NotFound, PlacewiseError
 from shared.imaging.preprocessing import Pixels
 from shared.jobs import Job, JobKind
 from shared.jobs.leases import lock_leased_job
@@ -36,8 +36,7 @@ from shared.search_api.comparison import (
     check_rerankable,
     query_expired_error,
 )
-from shared.storage import ObjectStore
-from shared.storage.keys import comparison_key, local_features_key, query_key
+from shared.storage.keys import comparison_key, query_key
 
 log = logging.getLogger(__name__)
 
@@ -122,46 +121,12 @@ def _load_features(
 ) -> Iterator[tuple[UUID, LocalFeatures]]:
     """Yield each photo's local features, in any order; at most one batch is held in memory.
 
-    With LOCAL_FEATURES=keep they are stored as the objects under `features/`. Photos are left out,
-    and logged by their ids, if they can't be read or decoded, are too large for the GPU's memory,
-    or have features that are not finite.
+    Photos are left out, and logged by their ids, if they can't be read or decoded, are too large
+    for the GPU's memory, or have features that are not finite.
     """
-    stores = context.settings.local_features == "keep"
     batch_photos = context.settings.batch_photos
     for begin in range(0, len(photos), batch_photos):
-        missing = []
-        for photo in photos[begin : begin + batch_photos]:
-            stored = _read_stored(context.store, target, photo.id) if stores else None
-            if stored is None:
-                missing.append(photo)
-            else:
-                yield photo.id, stored
-        for photo_id, features in _compute_features(context, target, missing):
-            if stores:
-                _write_stored(context.store, target, photo_id, features)
-            yield photo_id, features
-
-
-def _read_stored(
-    store: ObjectStore, target: ResolvedGeneration, photo_id: UUID
-) -> LocalFeatures | None:
-    key = local_features_key(target.generation.id, photo_id)
-    try:
-        return LocalFeatures.decode(store.get(key), target.extractor.backbone.width)
-    except NotFound:
-        return None
-    except ValueError as error:
-        log.error("the object %s is damaged (%s) and is computed again", key, error)
-        return None
-
-
-def _write_stored(
-    store: ObjectStore, target: ResolvedGeneration, photo_id: UUID, features: LocalFeatures
-) -> None:
-    try:
-        store.put(local_features_key(target.generation.id, photo_id), features.encode())
-    except StorageFull as error:  # only a cache: it is computed again the next time
-        log.warning("local features are not stored: %s", error.detail)
+        yield from _compute_features(context, target, photos[begin : begin + batch_photos])
 
 
 def _compute_features(

@@ -89,10 +89,10 @@ class ExtractorSettings(BaseSettings):
         description="describe the photos of a map whose extractor is shipped without a vocabulary "
         "by GeM pooling until the map has one; false: they wait for it",
     )
-    local_features: Literal["recompute", "keep"] = Field(
-        "recompute",
-        description="local features of compared photos: recompute them each time, or keep them as "
-        "float16 in the object store (97 kB per photo with the default extractor)",
+    local_features: Literal["xfeat", "aliked-n16"] = Field(
+        "xfeat",
+        description="local features of new generations, by which photos are matched: xfeat (at "
+        "most 70 kB a photo) or aliked-n16 (132 kB; slower, better; needs the extra `lightglue`)",
     )
 
     @field_validator("torchhub_allowed")

@@ -10,14 +10,15 @@
 | `models/<sha256>/<uuid>.safetensors` | an added model: its configuration and weights |
 | `thumbnails/<photo>` | a photo's thumbnail, JPEG |
 | `previews/<photo>` | a preview for browsers, JPEG, of a photo that needs one |
-| `chunks/<generation>/<chunk>.npy`, `.json`, `.codes` | descriptor rows, manifest, sign codes |
+| `chunks/<generation>/<chunk>.npy`, `.json` | descriptor rows, manifest |
+| `chunks/<generation>/<chunk>.codes`, `.features` | sign codes and local features of the rows |
 | `journal/<first>-<last>-<uuid>.jsonl.gz` | rows of the catalog (`shared.journal`) |
 | `vocabularies/<uuid>.npy` | VLAD centres |
 | `whitenings/<uuid>.safetensors` | PCA whitenings |
 | `queries/<job>`, `queries/<job>.npy` | a query photo that is not stored, and its descriptor |
+| `queries/<job>.features` | its local features |
 | `queries/<job>.jpg` | a preview of a query photo in a format that not all browsers show |
 | `queries/<job>.json` | the result of a comparison |
-| `features/<generation>/<photo>.npy` | a photo's local features, with LOCAL_FEATURES=keep |
 | `trash/<day>/<key>` | an orphan moved to the trash on that day, deleted after TRASH_DAYS |
 | `imports/...` | the operator's files, which Placewise only reads |
 

@@ -13,7 +13,6 @@ OWNER_MARK = ".placewise"  # the note with the id of the owner (`shared.storage.
 
 INCOMING = "incoming/"
 CHECKPOINTS = "checkpoints/"
-FEATURES = "features/"
 JOURNAL = "journal/"
 MODELS = "models/"
 ORIGINALS = "originals/"
@@ -123,6 +122,11 @@ def query_vector_key(job_id: UUID) -> str:
     return f"{QUERIES}{job_id}.npy"
 
 
+def query_features_key(job_id: UUID) -> str:
+    """Return the key of a query photo's local features, a feature file of one row."""
+    return f"{QUERIES}{job_id}.features"
+
+
 def query_preview_key(job_id: UUID) -> str:
     """Return the key of a query photo's preview, JPEG, if browsers need one."""
     return f"{QUERIES}{job_id}.jpg"
@@ -141,18 +145,10 @@ def query_object_keys(job_id: UUID) -> tuple[str, ...]:
     return (
         query_key(job_id),
         query_vector_key(job_id),
+        query_features_key(job_id),
         query_preview_key(job_id),
         comparison_key(job_id),
     )
-
-
-def local_features_prefix(generation_id: UUID) -> str:
-    """Return the key prefix of the local features of a generation's photos."""
-    return f"{FEATURES}{generation_id}/"
-
-
-def local_features_key(generation_id: UUID, photo_id: UUID) -> str:
-    return f"{local_features_prefix(generation_id)}{photo_id}.npy"
 
 
 def new_vocabulary_key() -> str:

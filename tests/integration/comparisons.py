@@ -62,10 +62,6 @@ def searches(service: Service) -> int:
         return session.scalar(select(func.count()).select_from(Search)) or 0
 
 
-def feature_keys(service: Service) -> set[str]:
-    return {info.key for info in service.store.list("features/")}
-
-
 def lose_bytes(service: Service, photo_id: str) -> None:
     with service.catalog.read() as session:
         service.store.delete(session.get_one(Photo, UUID(photo_id)).object_key)

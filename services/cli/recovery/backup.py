@@ -41,7 +41,6 @@ from shared.journal.segments import put_lines
 from shared.storage import FolderStore, ObjectStore
 from shared.storage.copying import copy_object, hash_object
 from shared.storage.keys import (
-    FEATURES,
     IMPORTS,
     INCOMING,
     JOURNAL,
@@ -62,7 +61,7 @@ COPIED = "copied.jsonl"
 
 # Not backed up: notes of the store, objects that can be recomputed, temporary objects of requests
 # and jobs, and orphans.
-EXCLUDED_PREFIXES = (OWNER_MARK, IMPORTS, INCOMING, QUERIES, FEATURES, PREVIEWS, TRASH)
+EXCLUDED_PREFIXES = (OWNER_MARK, IMPORTS, INCOMING, QUERIES, PREVIEWS, TRASH)
 
 BackupProgress = Callable[[str, int, int], object]
 """Progress callback: what is done, number done, total."""
@@ -333,7 +332,7 @@ class _Backup:
 
 
 def list_backup_objects(store: ObjectStore) -> Iterator[ObjectInfo]:
-    """Iterate over the objects to back up, referenced by rows or not (thumbnails, codes).
+    """Iterate over the objects to back up, referenced by rows or not (thumbnails, sign codes).
 
     Objects under `imports/` and files that people put into UPLOAD_DIR are the operator's.
     """

@@ -10,7 +10,6 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
-from itertools import chain, islice
 from uuid import UUID
 
 from sqlalchemy import delete, select
@@ -40,7 +39,6 @@ from shared.storage.keys import (
     ORIGINALS,
     derived_image_keys,
     incoming_key,
-    local_features_prefix,
     query_object_keys,
 )
 
@@ -76,7 +74,6 @@ def _purge_next(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
         _purge_presigned_uploads,
         _purge_searches,
         _purge_tracks,
-        _purge_local_features,  # last: it always lists the store
     ):
         if purge_rows(catalog, store, map_id):  # it deleted some; there may be more
             return False
@@ -192,16 +189,6 @@ def _purge_tracks(catalog: Catalog, _store: ObjectStore, map_id: UUID) -> bool:
         ids = session.scalars(some).all()
         delete_tracks(session, Track.id.in_(ids))
     return bool(ids)
-
-
-def _purge_local_features(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
-    with catalog.read() as session:
-        ids = session.scalars(select(Generation.id).where(Generation.map_id == map_id)).all()
-    objects = chain.from_iterable(store.list(local_features_prefix(id_)) for id_ in ids)
-    keys = [info.key for info in islice(objects, ROWS_PER_TRANSACTION)]
-    for key in keys:
-        store.delete(key)
-    return bool(keys)
 
 
 def _purge_vocabulary_objects(catalog: Catalog, store: ObjectStore, map_id: UUID) -> None:

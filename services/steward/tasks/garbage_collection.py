@@ -13,9 +13,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Sequence
-from itertools import islice
 from typing import TypeVar
-from uuid import UUID
 
 from sqlalchemy import Select, and_, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
@@ -39,8 +37,6 @@ from shared.storage.keys import (
     CHECKPOINTS,
     derived_image_keys,
     incoming_key,
-    local_features_key,
-    local_features_prefix,
     query_object_keys,
 )
 
@@ -117,8 +113,8 @@ def collect_superseded_chunks(catalog: Catalog, store: ObjectStore, grace_second
 def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
     """Delete the data of generations that were retired or abandoned `grace_seconds` ago.
 
-    Deletes their descriptors, chunks and local features, and the reindex jobs of abandoned ones.
-    The generation's own row stays as history until its map is deleted.
+    Deletes their descriptors and chunks, and the reindex jobs of abandoned ones. The generation's
+    own row stays as history until its map is deleted.
     """
     with catalog.read() as session:
         ended = session.scalars(
@@ -143,12 +139,6 @@ def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_second
     if abandoned_job_ids:
         with catalog.write() as session:
             session.execute(delete(Job).where(Job.id.in_(abandoned_job_ids)))
-    for generation_id in {chunk.generation_id for chunk in ended}:
-        prefix = local_features_prefix(generation_id)
-        # Listed again after some were deleted: a listing that goes on may skip others.
-        while infos := list(islice(store.list(prefix), ROWS_PER_TRANSACTION)):
-            for info in infos:
-                store.delete(info.key)
     for chunk in ended:
         delete_chunk(store, chunk.object_key)
         with catalog.write() as session:
@@ -181,9 +171,9 @@ def collect_whitenings(catalog: Catalog, store: ObjectStore, grace_seconds: floa
 def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
     """Delete the objects of deleted photos at once, and their rows after `grace_seconds`.
 
-    The objects (original, thumbnail, preview, local features) go as soon as the journal has
-    recorded the deletion. After the grace period every search worker has seen the deletion and
-    compaction has dropped the descriptors.
+    The objects (original, thumbnail, preview) go as soon as the journal has recorded the deletion.
+    After the grace period every search worker has seen the deletion and compaction has dropped the
+    descriptors and local features.
     """
     journal_deletions(catalog, store, Photo)
     with catalog.read() as session:
@@ -194,13 +184,10 @@ def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: 
             )
             .limit(ROWS_PER_TRANSACTION)
         ).all()
-        generation_ids = _generations_with_chunks(session, {photo.map_id for photo in photos})
     for photo in photos:
         store.delete(photo.object_key)
         for key in derived_image_keys(photo.id):
             store.delete(key)
-        for generation_id in generation_ids[photo.map_id]:
-            store.delete(local_features_key(generation_id, photo.id))
     photo_ids = [photo.id for photo in photos]
     with catalog.write() as session:
         if photo_ids:
@@ -211,19 +198,6 @@ def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: 
                 .values(object_key="", revision=Photo.revision)
             )
         _delete_photo_rows(session, grace_seconds)
-
-
-def _generations_with_chunks(session: Session, map_ids: set[UUID]) -> dict[UUID, list[UUID]]:
-    """Map id -> ids of its generations that have chunks; the others have no local features."""
-    generation_ids: dict[UUID, list[UUID]] = {map_id: [] for map_id in map_ids}
-    rows = session.execute(
-        select(Generation.map_id, Generation.id).where(
-            Generation.map_id.in_(map_ids), exists().where(Chunk.generation_id == Generation.id)
-        )
-    )
-    for map_id, generation_id in rows:
-        generation_ids[map_id].append(generation_id)
-    return generation_ids
 
 
 def _delete_photo_rows(session: Session, grace_seconds: float) -> None:

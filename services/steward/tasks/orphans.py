@@ -22,7 +22,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from shared.catalog.batch_items import BatchItem
-from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.chunks import Chunk
 from shared.catalog.database.base import db_now
 from shared.catalog.database.session import Catalog
 from shared.catalog.installation import check_not_behind
@@ -32,10 +32,9 @@ from shared.catalog.photos import Photo, PresignedUpload
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.errors import Conflict
 from shared.storage import ObjectStore, OwnedStore
-from shared.storage.chunks import codes_key, manifest_key
+from shared.storage.chunks import codes_key, features_key, manifest_key
 from shared.storage.keys import (
     CHECKPOINTS,
-    FEATURES,
     INCOMING,
     MODELS,
     ORIGINALS,
@@ -47,7 +46,6 @@ from shared.storage.keys import (
     derived_image_keys,
     incoming_key,
     is_original_key,
-    local_features_key,
     query_object_keys,
 )
 from shared.storage.protocol import ObjectInfo
@@ -260,7 +258,8 @@ def _referenced_derived_images(session: Session, keys: list[str]) -> Iterable[st
 def _referenced_chunks(session: Session, keys: list[str]) -> Iterable[str]:
     arrays = {key.rpartition(".")[0] + ".npy" for key in keys}
     stored = session.scalars(select(Chunk.object_key).where(Chunk.object_key.in_(arrays)))
-    return [name for key in stored for name in (key, manifest_key(key), codes_key(key))]
+    beside = (manifest_key, codes_key, features_key)
+    return [name for key in stored for name in (key, *(name_of(key) for name_of in beside))]
 
 
 def _referenced_vocabularies(session: Session, keys: list[str]) -> Iterable[str]:
@@ -284,23 +283,6 @@ def _referenced_queries(session: Session, keys: list[str]) -> Iterable[str]:
     return [key for job_id in stored for key in query_object_keys(job_id)]
 
 
-def _referenced_local_features(session: Session, keys: list[str]) -> Iterable[str]:
-    """Keys of live photos in generations that still have their descriptors."""
-    parts = [key.removeprefix(FEATURES).removesuffix(".npy").split("/") for key in keys]
-    generation_ids = _parse_uuids(names[0] for names in parts)
-    photo_ids = _parse_uuids(names[-1] for names in parts)
-    stored = session.execute(
-        select(Descriptor.generation_id, Descriptor.photo_id)
-        .join(Photo, Photo.id == Descriptor.photo_id)
-        .where(
-            Descriptor.generation_id.in_(generation_ids),
-            Descriptor.photo_id.in_(photo_ids),
-            Photo.deleted_at.is_(None),
-        )
-    )
-    return [local_features_key(generation_id, photo_id) for generation_id, photo_id in stored]
-
-
 def _parse_uuids(names: Iterable[str]) -> set[UUID]:
     """Return the names that are UUIDs; an object with another name belongs to no row."""
     ids = set()
@@ -322,5 +304,4 @@ REFERENCED_BY_PREFIX: dict[str, Callable[[Session, list[str]], Iterable[str]]] =
     VOCABULARIES: _referenced_vocabularies,
     WHITENINGS: _referenced_by_column(StoredWhitening.object_key),
     QUERIES: _referenced_queries,
-    FEATURES: _referenced_local_features,
 }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 from uuid import UUID
 
@@ -19,17 +18,14 @@ from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.photos import Photo, get_photo
-from shared.ids import new_id
 from shared.jobs import Job, JobKind
 from shared.storage import FolderStore
 from shared.storage.keys import (
-    local_features_key,
     preview_key,
     query_key,
     query_vector_key,
     thumbnail_key,
 )
-from shared.storage.protocol import ObjectInfo
 from tests.integration.steward.chunk_map import HOUR_SECONDS, ChunkMap
 from tests.integration.steward.test_compaction import sum_of
 from tests.support.catalog_rows import add_chunk, add_generation, add_job, ask, stored_rows, upload
@@ -80,35 +76,6 @@ def test_ended_generations_lose_their_chunks_after_the_grace_and_not_before(
         assert set(session.scalars(select(Descriptor.generation_id))) == {active}
         assert session.scalar(select(func.count()).select_from(Generation)) == 3  # as history
     collect_ended_generations(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
-
-
-def test_local_features_of_an_ended_generation_are_listed_in_small_parts(
-    chunk_map: ChunkMap, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(f"{collect_ended_generations.__module__}.ROWS_PER_TRANSACTION", 2)
-    chunk_map.chunks(1)
-    keys = [local_features_key(chunk_map.generation_id, new_id()) for _ in range(5)]
-    for key in keys:
-        chunk_map.store.put(key, b"features")
-    chunk_map.change(
-        Generation,
-        chunk_map.generation_id,
-        state=GenerationState.RETIRED,
-        ended_at=db_now_plus(-HOUR_SECONDS - 1),
-    )
-    listed: list[int] = []
-    list_objects = chunk_map.store.list
-
-    def count(prefix: str) -> Iterator[ObjectInfo]:
-        listed.append(0)
-        for info in list_objects(prefix):
-            listed[-1] += 1
-            yield info
-
-    monkeypatch.setattr(chunk_map.store, "list", count)
-    collect_ended_generations(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
-    assert listed == [2, 2, 1, 0]
-    assert not chunk_map.objects("features/")
 
 
 def test_a_deleted_photos_bytes_go_at_once_and_its_row_after_the_grace(chunk_map: ChunkMap) -> None:
