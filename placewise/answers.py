@@ -409,6 +409,16 @@ class Search(Answer):
     searched_at: datetime
 
 
+class MapFeatures(Answer):
+    """Local features of a map's active generation."""
+
+    model: str | None
+    photos: int
+    missing: int
+    bytes: int
+    used: bool | None
+
+
 class Map(Answer):
     """A map with its counts and its active generation."""
 
@@ -430,6 +440,9 @@ class Map(Answer):
     place_labels_are_automatic: bool = False
     rows: str = "float32"
     auto_fit: bool = True
+    matching: str = "auto"
+    local_features: MapFeatures | None = None
+    model_change_id: UUID | None = None
     next_fit_photos: int | None = None
     created_at: datetime
 

@@ -457,11 +457,13 @@ class AsyncClient(AsyncTransport):
         place_labels_are_paths: bool | None = None,
         rows: str | None = None,
         auto_fit: bool = True,
+        matching: str | None = None,
     ) -> answers.Map:
         """Create a map; `extractor` and `rows` (float32 or float16) default to the settings.
 
         With `place_labels_are_paths`, `/` separates the levels of place labels, or not; by default,
-        evaluations decide that by the labels.
+        evaluations decide that by the labels. `matching` (auto, on or off) is whether local
+        features of its photos are computed and matched.
         """
         body = drop_none(
             name=name,
@@ -469,6 +471,7 @@ class AsyncClient(AsyncTransport):
             place_labels_are_paths=place_labels_are_paths,
             rows=rows,
             auto_fit=None if auto_fit else False,
+            matching=matching,
         )
         return answers.Map(**await self._call("POST", "/maps", json=body))
 
@@ -479,6 +482,7 @@ class AsyncClient(AsyncTransport):
         place_labels_are_paths: bool | Literal["auto"] | None = None,
         rows: str | None = None,
         auto_fit: bool | None = None,
+        matching: str | None = None,
     ) -> answers.Map:
         """Change settings of a map; None leaves one unchanged.
 
@@ -487,9 +491,14 @@ class AsyncClient(AsyncTransport):
                 the labels decide, now and at each evaluation.
             rows: float32 or float16, for generations that are created from then on.
             auto_fit: Whether vocabularies are fitted automatically.
+            matching: auto, on or off. With on, a model change (`model_change_id`) computes local
+                features that are missing.
         """
         body = drop_none(
-            place_labels_are_paths=place_labels_are_paths, rows=rows, auto_fit=auto_fit
+            place_labels_are_paths=place_labels_are_paths,
+            rows=rows,
+            auto_fit=auto_fit,
+            matching=matching,
         )
         return answers.Map(**await self._call("PATCH", f"/maps/{quote(name, safe='')}", json=body))
 

@@ -28,6 +28,11 @@ app = typer.Typer(
     help="Manage maps: named photo databases, each with its own extractor and vocabulary."
 )
 
+MATCHING_HELP = (
+    "Compute and match local features of its photos: on, off, or auto: until an evaluation finds "
+    "that matches do not improve the answers."
+)
+
 MapName = Annotated[str, typer.Argument(metavar="NAME")]
 
 
@@ -65,6 +70,14 @@ def _format_dimension(map_: Map) -> str:
     return f"{map_.dimension}{pca_note}"
 
 
+def _format_features(map_: Map) -> str:
+    features = map_.local_features
+    if features is None or not features.photos:
+        return map_.matching
+    used = {True: ", used", False: ", not used", None: ""}[features.used]
+    return f"{map_.matching}: {features.photos} photos, {features.bytes / 1e6:.1f} MB{used}"
+
+
 @app.command("create")
 def create(
     name: MapName,
@@ -89,6 +102,7 @@ def create(
             "Default: the setting DESCRIPTOR_ROWS."
         ),
     ] = None,
+    matching: Annotated[str | None, typer.Option(help=f"{MATCHING_HELP} Default: auto.")] = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
@@ -96,7 +110,11 @@ def create(
     """Create an empty map."""
     with connect(server, None, key) as client:
         created = client.create_map(
-            name, extractor, place_labels_are_paths=place_labels_are_paths, rows=rows
+            name,
+            extractor,
+            place_labels_are_paths=place_labels_are_paths,
+            rows=rows,
+            matching=matching,
         )
     print_result(created, as_json, f"Created map {name} with extractor {created.extractor}.")
 
@@ -105,21 +123,32 @@ def create(
 def update(
     name: MapName,
     auto_fit: Annotated[
-        bool,
+        bool | None,
         typer.Option(
             "--auto-fit/--no-auto-fit",
             help=f"Fit a vocabulary at {MIN_PHOTOS_TO_FIT} photos, and whenever the map has "
             "doubled since the last fit.",
         ),
-    ],
+    ] = None,
+    matching: Annotated[str | None, typer.Option(help=MATCHING_HELP)] = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Change whether vocabularies are fitted automatically for a map."""
-    with connect(server, None, key) as client:
-        updated = client.update_map(name, auto_fit=auto_fit)
-    print_result(updated, as_json, f"Map {name}: {_describe_auto_fit(updated)}.")
+    """Change automatic fits and matching of a map.
+
+    `--matching on` waits until photos without local features have them; searches continue.
+    """
+    if auto_fit is None and matching is None:
+        raise InvalidRequest("no_option", "Specify --auto-fit, --no-auto-fit or --matching.")
+    with connect(server, name, key) as client, progress_bar() as progress:
+        updated = client.update_map(name, auto_fit=auto_fit, matching=matching)
+        if matching == "on" and updated.model_change_id:
+            wait_for_job(client, client.job(updated.model_change_id), progress, "local features")
+            updated = next(map_ for map_ in client.maps() if map_.name == name)
+    changes = [_describe_auto_fit(updated)] if auto_fit is not None else []
+    changes += [f"matching {_format_features(updated)}"] if matching else []
+    print_result(updated, as_json, f"Map {name}: {'; '.join(changes)}.")
 
 
 def _describe_auto_fit(map_: Map) -> str:

@@ -65,6 +65,7 @@ class DecoderPool:
         preprocessing: Preprocessing,
         *,
         previews: Previews = Previews.NONE,
+        working: bool = False,
     ) -> list[DecodedPhoto | PlacewiseError]:
         """Decode photos; each result is a decoded photo, or the error that explains the failure.
 
@@ -81,6 +82,7 @@ class DecoderPool:
             preprocessing=preprocessing,
             max_pixels=self._settings.max_image_pixels,
             previews=previews,
+            working=working,
         )
         outcomes: list[DecodedPhoto | PlacewiseError] = []
         pending: deque[tuple[ProcessFuture[DecodedPhoto], bytes]] = deque()

@@ -1,8 +1,8 @@
 """Handler of `index`, `reindex` and `describe` jobs: describes the photos of a batch.
 
-A batch that is reindexed needs no photos if its rows follow from those of the active generation:
-with the same spec before PCA, they are projected; with the same spec and more precision, they are
-rounded.
+A batch that is reindexed is not described again if its rows follow from those of the active
+generation: with the same spec before PCA, they are projected; with the same spec and at least the
+same precision, they are copied. Local features that the active generation has are copied.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from services.extractor.generation_resolver import (
     resolve_generation,
 )
 from services.extractor.handlers import ExtractorContext, JobBatch, handles
+from services.extractor.local_features import BatchFeatures, prepare_features
 from services.extractor.publish import photo_id_of, publish
 from shared.catalog.chunks import find_descriptor_rows
 from shared.catalog.database.session import Catalog
@@ -50,13 +51,19 @@ def describe_photos(context: ExtractorContext, batch: JobBatch) -> Iterator[None
     if target is None:
         requeue_until_vocabulary(context.catalog, batch)
         return
-    photos = _read_rows(context, batch, target) or _read_photos(context, batch, target)
+    features = prepare_features(context, batch, target)
+    photos = _read_rows(context, batch, target, features) or _read_photos(
+        context, batch, target, features
+    )
     yield
     with batch.timed("describe"):
         rows = photos.compute_rows(target.generation.dimension)
+    if features:
+        with batch.timed("features"):
+            features.detect()
     yield
     with batch.timed("publish"):
-        publish(context, batch, target.generation, photos.ready, photos.failed, rows)
+        publish(context, batch, target.generation, photos.ready, photos.failed, rows, features)
 
 
 @dataclass(slots=True)
@@ -95,7 +102,10 @@ class _PreparedPhotos:
 
 
 def _read_photos(
-    context: ExtractorContext, batch: JobBatch, target: ResolvedGeneration
+    context: ExtractorContext,
+    batch: JobBatch,
+    target: ResolvedGeneration,
+    features: BatchFeatures | None,
 ) -> _PreparedPhotos:
     """Read and decode the photos; store thumbnails and previews of new ones.
 
@@ -104,13 +114,40 @@ def _read_photos(
     photos = _PreparedPhotos(
         lambda pixels: target.extractor.describe(pixels, target.centres, target.projection)
     )
+    working = features is not None and bool(features.missing)
+    decoded, photos.failed = _decode_photos(context, batch, batch.jobs, target, working=working)
+    # Stored here and not with the chunk, while the model runs the previous batch.
+    with batch.timed("thumbnails"):
+        for job, photo in decoded:
+            photos.ready.append(job)
+            photos.inputs.append(photo.pixels)
+            _store_previews(context.store, job, photo)
+            if features:
+                features.add_photo(job, photo)
+    return photos
+
+
+def _decode_photos(
+    context: ExtractorContext,
+    batch: JobBatch,
+    jobs: Sequence[Job],
+    target: ResolvedGeneration,
+    *,
+    working: bool,
+) -> tuple[list[tuple[Job, DecodedPhoto]], list[tuple[Job, PlacewiseError]]]:
+    """Read and decode the photos of some jobs of the batch; return them and the failures.
+
+    Deleted photos are left out.
+    """
     with batch.timed("read"):
         keys = _photo_object_keys(context.catalog, batch.jobs)
     present: list[Job] = []
+    decoded: list[tuple[Job, DecodedPhoto]] = []
+    failed: list[tuple[Job, PlacewiseError]] = []
 
     def read() -> Iterator[bytes]:
         # Read as they are decoded: a batch of the largest photos would take gigabytes.
-        for job in batch.jobs:
+        for job in jobs:
             if job.id not in keys:
                 continue
             try:
@@ -119,7 +156,7 @@ def _read_photos(
             except NotFound as error:
                 # Deleted since the catalog was read, or lost: `publish` checks under the map's
                 # lock.
-                photos.failed.append((job, error))
+                failed.append((job, error))
                 continue
             present.append(job)
             yield data
@@ -127,18 +164,14 @@ def _read_photos(
     previews = PREVIEWS_BY_KIND.get(batch.kind, Previews.NONE)
     with batch.timed("decode"):
         outcomes = context.decoders.decode(
-            read(), target.extractor.preprocessing, previews=previews
+            read(), target.extractor.preprocessing, previews=previews, working=working
         )
-    # Stored here and not with the chunk, while the model runs the previous batch.
-    with batch.timed("thumbnails"):
-        for job, outcome in zip(present, outcomes, strict=True):
-            if isinstance(outcome, PlacewiseError):
-                photos.failed.append((job, outcome))
-                continue
-            photos.ready.append(job)
-            photos.inputs.append(outcome.pixels)
-            _store_previews(context.store, job, outcome)
-    return photos
+    for job, outcome in zip(present, outcomes, strict=True):
+        if isinstance(outcome, PlacewiseError):
+            failed.append((job, outcome))
+        else:
+            decoded.append((job, outcome))
+    return decoded, failed
 
 
 def _store_previews(store: ObjectStore, job: Job, decoded: DecodedPhoto) -> None:
@@ -164,9 +197,14 @@ def _photo_object_keys(catalog: Catalog, jobs: list[Job]) -> dict[UUID, str]:
 
 
 def _read_rows(
-    context: ExtractorContext, batch: JobBatch, target: ResolvedGeneration
+    context: ExtractorContext,
+    batch: JobBatch,
+    target: ResolvedGeneration,
+    features: BatchFeatures | None,
 ) -> _PreparedPhotos | None:
     """Read stored rows instead of the photos of REINDEX jobs; deleted photos are left out.
+
+    Photos are decoded only for local features that are missing.
 
     Returns None if the photos have to be described: the target's rows do not follow from those of
     the active generation, or the row of a photo is missing.
@@ -181,7 +219,7 @@ def _read_rows(
         if source is None:
             return None
         row_types = (source.row_type, target.generation.row_type)
-        if source.spec == target.spec and row_types == (RowType.FLOAT32, RowType.FLOAT16):
+        if source.spec == target.spec and row_types != (RowType.FLOAT16, RowType.FLOAT32):
             projection = None
         elif target.projection and source.spec == target.extractor.spec(target.centres):
             projection = target.projection
@@ -196,6 +234,13 @@ def _read_rows(
         return stacked if projection is None else projection.project(stacked)
 
     ready = [job for job in batch.jobs if job.photo_id in rows]
+    if features and features.missing:
+        missing = [job for job in ready if job.id in features.missing]
+        decoded, failed = _decode_photos(context, batch, missing, target, working=True)
+        for job, photo in decoded:
+            features.add_photo(job, photo)
+        for job, error in failed:
+            log.warning("the photo %s gets no local features: %s", job.photo_id, error.detail)
     return _PreparedPhotos(convert, ready, [rows[photo_id_of(job)] for job in ready])
 
 

@@ -37,7 +37,7 @@ from shared.extractor_config.configs import pooled_config
 from shared.ids import new_id
 from shared.jobs import Job, JobKind
 from shared.jobs.leases import lock_leased_jobs
-from shared.jobs.model_changes import start_model_change, wake_vocabulary_waiters
+from shared.jobs.model_changes import start_reindex, wake_vocabulary_waiters
 from shared.jobs.transitions import fail_job, requeue_job
 from shared.storage.keys import new_vocabulary_key
 
@@ -175,19 +175,11 @@ def reindex_outdated_generations(catalog: Catalog, models: ModelRegistry) -> int
             continue
         if spec_fingerprint(pipeline.spec) == generation.spec_fingerprint:
             continue
-        params = {
-            "vocabulary_id": _text(generation.vocabulary_id),
-            "whitening_id": _text(generation.whitening_id),
-        }
         try:
             with catalog.write() as session:
-                start_model_change(session, generation.map_id, JobKind.SWITCH, params)
+                start_reindex(session, generation)
         except Conflict:
             continue  # a model change is running and will use the new spec
         log.warning("generation %s has an outdated spec: reindexing its map", generation.id)
         started += 1
     return started
-
-
-def _text(id_: UUID | None) -> str | None:
-    return None if id_ is None else str(id_)

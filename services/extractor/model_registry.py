@@ -25,8 +25,9 @@ from shared.descriptors.extractor import Extractor, choose_device, spec_fingerpr
 from shared.descriptors.inference import PRECISIONS, BatchSizeLimit, Precision, choose_precision
 from shared.descriptors.pca_whitening import PcaProjection, decode_whitening
 from shared.descriptors.vocabulary import ClusterCentres, decode_centres
-from shared.errors import PlacewiseError, Unavailable
+from shared.errors import Misconfigured, PlacewiseError, Unavailable
 from shared.extractor_config.configs import ExtractorConfig
+from shared.matching.detectors import Detector, load_detector
 from shared.storage import ObjectStore
 
 LoadAddedModel = Callable[[str, torch.device], Backbone]
@@ -154,6 +155,24 @@ class ModelRegistry:
             extractor.warm_up(self._settings.batch_photos)
         self._on_load(time.perf_counter() - started)
         return extractor
+
+    def detector(self, name: str) -> Detector:
+        """Return the detector of local features called `name` with its weights loaded.
+
+        Raises:
+            Misconfigured: as `load_detector`.
+        """
+        with self._lock:
+            try:
+                detector = load_detector(name, self._device)
+            except Misconfigured as error:
+                self._load_errors[name] = error.code
+                raise
+            else:
+                self._load_errors.pop(name, None)
+            finally:
+                self._update_state()
+            return detector
 
     def centres(self, vocabulary: Vocabulary) -> ClusterCentres:
         """Return the vocabulary's centres, verified against the catalog's hash."""

@@ -18,6 +18,7 @@ from sqlalchemy import insert, select
 from sqlalchemy.orm import Session
 
 from services.extractor.handlers import ExtractorContext, JobBatch
+from services.extractor.local_features import BatchFeatures
 from shared.catalog.chunks import Chunk, Descriptor, allocate_slot
 from shared.catalog.generations import Generation, GenerationState, lock_generation
 from shared.catalog.maps import increment_map_version, lock_map
@@ -29,7 +30,8 @@ from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.runner import distinct_request_ids
 from shared.jobs.transitions import cancel_job, fail_job, requeue_job, succeed_job
 from shared.storage.chunks import Rows, WrittenChunk, encode_rows, write_chunk
-from shared.storage.keys import query_vector_key
+from shared.storage.feature_files import encode_feature_file
+from shared.storage.keys import query_features_key, query_vector_key
 
 log = logging.getLogger(__name__)
 
@@ -50,12 +52,16 @@ def publish(
     ready: Sequence[Job],
     failed: Failures,
     rows: Rows,
+    features: BatchFeatures | None,
 ) -> None:
     """Store and commit the (n, dimension) rows of the jobs in `ready`; fail those in `failed`."""
     chunk_id, written = new_id(), None
     if batch.kind == JobKind.DESCRIBE:
         for job, row in zip(ready, rows, strict=True):
             context.store.put(query_vector_key(job.id), encode_rows(row[np.newaxis]))
+            if features and job.id in features.encoded:
+                file = encode_feature_file(features.rows([job]))
+                context.store.put(query_features_key(job.id), file)
     elif ready:
         written = write_chunk(
             context.store,
@@ -64,6 +70,7 @@ def publish(
             rows=rows.astype(generation.row_type, copy=False),
             photo_ids=[photo_id_of(job) for job in ready],
             spec=generation.spec,
+            features=features.rows(ready) if features else None,
         )
 
     def commit(session: Session) -> Counter[str]:

@@ -7,6 +7,7 @@ ones. A row that no descriptor refers to is dead; the next compaction drops it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from uuid import UUID
 
@@ -89,14 +90,21 @@ def find_descriptor(
 
 
 def find_descriptor_rows(
-    session: Session, generation_id: UUID, photo_ids: Sequence[UUID]
+    session: Session,
+    generation_id: UUID,
+    photo_ids: Sequence[UUID],
+    *,
+    features_model: str | None = None,
 ) -> dict[str, list[tuple[int, UUID]]]:
     """Locate the descriptors of photos in the generation; photos without one are left out.
+
+    With `features_model`, those in chunks without local features of that model are left out, too.
 
     Returns:
         Object key of a chunk -> (row, photo id) of its descriptors, sorted by row.
     """
     rows_by_key: dict[str, list[tuple[int, UUID]]] = {}
+    has_features = sa.true() if features_model is None else Chunk.features_model == features_model
     for begin in range(0, len(photo_ids), IDS_PER_QUERY):
         located = session.execute(
             sa.select(Chunk.object_key, Descriptor.row, Descriptor.photo_id)
@@ -104,6 +112,7 @@ def find_descriptor_rows(
             .where(
                 Descriptor.generation_id == generation_id,
                 Descriptor.photo_id.in_(photo_ids[begin : begin + IDS_PER_QUERY]),
+                has_features,
             )
         )
         for object_key, row, photo_id in located:
@@ -111,6 +120,43 @@ def find_descriptor_rows(
     for rows in rows_by_key.values():
         rows.sort()
     return rows_by_key
+
+
+def find_features_model(session: Session, generation_id: UUID) -> str | None:
+    """Return the model of the generation's newest local features; None if it has none."""
+    return session.scalar(
+        sa.select(Chunk.features_model)
+        .where(
+            Chunk.generation_id == generation_id,
+            Chunk.superseded_at.is_(None),
+            Chunk.features_model.is_not(None),
+        )
+        .order_by(Chunk.id.desc())
+        .limit(1)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureCounts:
+    """Local features of a generation's live chunks; rows of deleted photos may be among them."""
+
+    photos: int
+    size_bytes: int
+    missing: int
+    """rows without features of this detector"""
+
+
+def count_features(session: Session, generation_id: UUID, detector: str) -> FeatureCounts:
+    """Count the local features of the generation."""
+    is_detected = Chunk.features_model.startswith(f"{detector}@")
+    columns = (
+        Chunk.features_rows,
+        Chunk.features_bytes,
+        Chunk.rows - sa.case((is_detected, Chunk.features_rows), else_=0),
+    )
+    sums = [sa.func.coalesce(sa.func.sum(column), 0) for column in columns]
+    live = (Chunk.generation_id == generation_id) & Chunk.superseded_at.is_(None)
+    return FeatureCounts(*map(int, session.execute(sa.select(*sums).where(live)).one()))
 
 
 def list_live_chunks(session: Session, generation_id: UUID) -> list[Chunk]:

@@ -105,6 +105,7 @@ def create_map(
     place_labels_are_paths: bool | None = None,
     row_type: RowType = RowType.FLOAT32,
     auto_fit: bool = True,
+    matching: Matching = Matching.AUTO,
 ) -> Map:
     """Create an empty map; Conflict (`map_exists`) when the name is taken.
 
@@ -118,6 +119,7 @@ def create_map(
         place_labels_are_automatic=place_labels_are_paths is None,
         row_type=row_type,
         auto_fit=auto_fit,
+        matching=matching,
     )
     try:
         with session.begin_nested():

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from PIL import __version__ as pillow_version
 from PIL.ExifTags import Base
@@ -38,6 +39,7 @@ from shared.imaging.file_formats import (
 from shared.imaging.file_structure import open_photo
 from shared.imaging.photo_header import ROTATED_ORIENTATIONS
 from shared.imaging.preprocessing import Pixels, Preprocessing
+from shared.matching.features import WORKING_SIDE
 
 # Larger JPEGs are decoded at half their size. The results of smaller ones stay as they always were.
 FULL_DECODE_PIXELS = 50_000_000
@@ -65,6 +67,11 @@ class DecodedPhoto:
     preview: bytes | None = None
     """The same with PREVIEW_PIXELS; None if not requested, or if the photo needs none
     (`shared.imaging.file_formats.needs_preview`)."""
+    size: tuple[int, int] = (0, 0)
+    """(width, height) of the upright photo."""
+    working: NDArray[np.uint8] | None = None
+    """(height, width, 3) RGB of the upright photo, its longer side at most WORKING_SIDE; None if
+    not requested."""
 
 
 def decode_photo(
@@ -73,8 +80,9 @@ def decode_photo(
     max_pixels: int,
     *,
     previews: Previews = Previews.NONE,
+    working: bool = False,
 ) -> DecodedPhoto:
-    """Decode and preprocess a photo, and make its upright thumbnail and preview.
+    """Decode and preprocess a photo, and make its upright thumbnail, preview and `working` copy.
 
     Only the first frame is read. Transparent areas become black; 16-bit samples keep their upper
     eight bits. A JPEG of more than FULL_DECODE_PIXELS is decoded at half its width and height,
@@ -90,6 +98,7 @@ def decode_photo(
             media_type = detect_media_type(data[:PHOTO_SIGNATURE_BYTES])
             with _open_image(data, media_type) as image:
                 check_pixel_count(image.width, image.height, max_pixels)
+                size = image.size
                 with_preview = needs_preview(media_type, image.width, image.height, previews)
                 if image.width * image.height > FULL_DECODE_PIXELS:
                     # None keeps the mode; other formats than JPEG ignore the call.
@@ -97,10 +106,15 @@ def decode_photo(
                 image.load()
                 as_stored = _to_rgb(image)
                 upright = _apply_exif_orientation(image, as_stored)
+                if _is_sideways(image):
+                    size = size[::-1]
             pixels = preprocessing.apply(upright if preprocessing.upright else as_stored)
             thumbnail = _small_jpeg(upright, THUMBNAIL_PIXELS, quality=85)
             preview = _small_jpeg(upright, PREVIEW_PIXELS, quality=80) if with_preview else None
-            return DecodedPhoto(pixels, thumbnail, preview)
+            small = _shrink(upright, WORKING_SIDE, reducing_gap=2.0) if working else None
+            return DecodedPhoto(
+                pixels, thumbnail, preview, size, None if small is None else np.asarray(small)
+            )
     except UnidentifiedImageError as error:
         raise Unprocessable(
             "undecodable_photo",
@@ -166,12 +180,17 @@ def _to_rgb(image: Image.Image) -> Image.Image:
     return on_black
 
 
-def _small_jpeg(rgb: Image.Image, longer_side: int, *, quality: int) -> bytes:
-    """Encode a copy whose longer side has at most `longer_side` pixels, without any metadata."""
+def _shrink(rgb: Image.Image, longer_side: int, *, reducing_gap: float) -> Image.Image:
+    """Return a copy whose longer side has at most `longer_side` pixels."""
     scale = min(1.0, longer_side / max(rgb.size))
     size = max(1, round(rgb.width * scale)), max(1, round(rgb.height * scale))
+    return rgb.resize(size, Image.Resampling.BICUBIC, reducing_gap=reducing_gap)
+
+
+def _small_jpeg(rgb: Image.Image, longer_side: int, *, quality: int) -> bytes:
+    """Encode a copy whose longer side has at most `longer_side` pixels, without any metadata."""
     # Averaged over integer blocks first: a fraction of the time, no visible difference.
-    small = rgb.resize(size, Image.Resampling.BICUBIC, reducing_gap=1.0)
+    small = _shrink(rgb, longer_side, reducing_gap=1.0)
     small.info.clear()  # removes the camera's metadata (location, time, owner)
     buffer = io.BytesIO()
     small.save(buffer, "JPEG", quality=quality)

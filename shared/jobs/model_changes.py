@@ -34,7 +34,7 @@ from shared.catalog.jobs import (
     Priority,
     WaitingFor,
 )
-from shared.catalog.maps import increment_map_version, lock_map
+from shared.catalog.maps import Matching, increment_map_version, lock_map
 from shared.catalog.photos import PhotoRole, count_live_photos
 from shared.errors import Conflict
 from shared.ids import new_id
@@ -80,6 +80,16 @@ def start_model_change(
     return job
 
 
+def start_reindex(session: Session, generation: Generation) -> Job:
+    """Queue a model change with the vocabulary and whitening of the map's active generation.
+
+    Rows whose spec is still the same are copied. Raises as `start_model_change` does.
+    """
+    ids = {"vocabulary_id": generation.vocabulary_id, "whitening_id": generation.whitening_id}
+    params = {name: None if id_ is None else str(id_) for name, id_ in ids.items()}
+    return start_model_change(session, generation.map_id, JobKind.SWITCH, params)
+
+
 def get_unfinished_model_change(session: Session, map_id: UUID) -> Job | None:
     """Return the unfinished model change of the map, if any."""
     return session.scalar(
@@ -96,13 +106,17 @@ def create_generation(session: Session, job: Job, **columns: Any) -> Generation:
     a vocabulary are described into it. Otherwise it is built while the active one serves queries.
     """
     map_ = lock_map(session, job.map_id)
-    first = active_generation(session, job.map_id) is None
+    active = active_generation(session, job.map_id)
+    first = active is None
+    is_decided = active and active.uses_matches is False and map_.matching == Matching.AUTO
     generation = Generation(
         id=new_id(),
         map_id=job.map_id,
         state=GenerationState.ACTIVE if first else GenerationState.BUILDING,
         activated_at=db_now() if first else None,
         row_type=map_.row_type,
+        # Without features, an evaluation could not decide it again.
+        uses_matches=False if is_decided else None,
         **columns,
     )
     session.add(generation)

@@ -13,10 +13,14 @@ Rows are read by range.
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +53,7 @@ class FeatureRows:
 
     model: str
     """`Detector.model`"""
-    rows: Sequence[bytes]
+    rows: Sequence[bytes | memoryview]
     """encoded features by row; empty for photos without"""
 
 
@@ -70,16 +74,20 @@ def read_feature_index(store: ObjectStore, key: str) -> FeatureIndex:
         NotFound: The object is missing.
     """
     with store.open(key) as file:
-        start = read_up_to(file, _START.size)
-        magic, size = _START.unpack(start) if len(start) == _START.size else (b"", 0)
-        if magic != MAGIC or size > MAX_HEADER_BYTES:
-            raise ValueError(f"{key} is not a feature file")
-        try:
-            header = json.loads(read_up_to(file, size))
-            model, rows = str(header["model"]), int(header["rows"])
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"the header of {key} is damaged") from error
-        offsets = np.frombuffer(read_up_to(file, 8 * (rows + 1)), "<u8")
+        return _read_index(file, key)
+
+
+def _read_index(file: BinaryIO, key: str) -> FeatureIndex:
+    start = read_up_to(file, _START.size)
+    magic, size = _START.unpack(start) if len(start) == _START.size else (b"", 0)
+    if magic != MAGIC or size > MAX_HEADER_BYTES:
+        raise ValueError(f"{key} is not a feature file")
+    try:
+        header = json.loads(read_up_to(file, size))
+        model, rows = str(header["model"]), int(header["rows"])
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"the header of {key} is damaged") from error
+    offsets = np.frombuffer(read_up_to(file, 8 * (rows + 1)), "<u8")
     if len(offsets) != rows + 1 or (np.diff(offsets.astype(np.int64)) < 0).any():
         raise ValueError(f"the offsets of {key} are damaged")
     return FeatureIndex(model, offsets)
@@ -107,3 +115,19 @@ def read_feature_rows(
             if len(found[row]) < end - begin:
                 raise ValueError(f"{key} is too short")
     return found
+
+
+def read_feature_file(store: ObjectStore, key: str, sha256: str | None) -> FeatureRows:
+    """Read a whole feature file, and verify its hash.
+
+    Raises:
+        ValueError: The file is damaged.
+        NotFound: The object is missing.
+    """
+    data = store.get(key)
+    if hashlib.sha256(data).hexdigest() != sha256:
+        raise ValueError("its hash differs")
+    index, view = _read_index(io.BytesIO(data), key), memoryview(data)
+    return FeatureRows(
+        index.model, [view[begin:end] for begin, end in pairwise(index.offsets.tolist())]
+    )

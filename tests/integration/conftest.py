@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from uuid import UUID
@@ -21,10 +21,6 @@ from shared.catalog import vocabularies
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_or_create_default_map
 from shared.config.settings import Settings
-from shared.errors import PlacewiseError
-from shared.imaging.decode import DecodedPhoto
-from shared.imaging.file_formats import Previews
-from shared.imaging.preprocessing import Preprocessing
 from shared.storage import FolderStore
 from tests.integration.api_with_keys import Door
 from tests.integration.in_process_api import Service
@@ -40,14 +36,8 @@ class LentDecoders:
     def __init__(self, pool: DecoderPool) -> None:
         self._pool = pool
 
-    def decode(
-        self,
-        photos: Sequence[bytes],
-        preprocessing: Preprocessing,
-        *,
-        previews: Previews = Previews.NONE,
-    ) -> list[DecodedPhoto | PlacewiseError]:
-        return self._pool.decode(photos, preprocessing, previews=previews)
+    def decode(self, *photos: Any, **options: Any) -> Any:
+        return self._pool.decode(*photos, **options)
 
     def close(self) -> None:
         pass

@@ -15,12 +15,14 @@ from services.gateway.authentication import READ, WRITE, get_caller
 from services.gateway.dependencies import ALL_MAPS, NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep
 from services.gateway.idempotency import IdempotentDep
 from services.gateway.schemas import RequestModel, ResponseModel
+from shared.catalog.chunks import count_features, find_features_model
 from shared.catalog.generations import Generation, RowType, active_generation
 from shared.catalog.jobs import UNFINISHED_STATES, list_jobs
 from shared.catalog.maps import (
     DEFAULT_MAP,
     MAP_NAME_PATTERN,
     Map,
+    Matching,
     create_map,
     decide_label_paths,
     get_map,
@@ -39,6 +41,7 @@ from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import PlaceModel
 from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.jobs import Job, JobKind, JobState
+from shared.jobs.model_changes import get_unfinished_model_change, start_reindex
 from shared.jobs.transitions import cancel_jobs
 
 router = APIRouter(tags=["maps"], dependencies=[NO_PARAMETERS])
@@ -59,6 +62,10 @@ CHECK_MAP = Depends(_check_map)
 AUTO_FIT = (
     f"whether a vocabulary is fitted automatically: at {MIN_PHOTOS_TO_FIT} photos, and whenever "
     "the map has doubled since the last fit. Importing or choosing a vocabulary sets it to false"
+)
+MATCHING = (
+    "whether local features of its photos are computed and matched: `on`, `off`, or `auto`: until "
+    "an evaluation finds that matches do not improve the answers"
 )
 
 
@@ -81,6 +88,7 @@ class CreateMapRequest(RequestModel):
         "omitted: the default of the server",
     )
     auto_fit: bool = Field(True, description=AUTO_FIT)
+    matching: Matching = Field(Matching.AUTO, description=MATCHING)
 
     @field_validator("name")
     @classmethod
@@ -104,6 +112,21 @@ class UpdateMapRequest(RequestModel):
         "omitted: unchanged",
     )
     auto_fit: bool | None = Field(None, description=f"{AUTO_FIT}; omitted: unchanged")
+    matching: Matching | None = Field(
+        None,
+        description=f"{MATCHING}. `on` starts a model change if photos have no local features yet; "
+        "omitted: unchanged",
+    )
+
+
+class LocalFeaturesResponse(ResponseModel):
+    model: str | None = Field(description="detector and its version, `xfeat@0f5187fd7bed`")
+    photos: int = Field(description="photos with local features; deleted ones may be among them")
+    missing: int = Field(description="searchable photos without")
+    bytes: int
+    used: bool | None = Field(
+        description="whether searches use matches as evidence; null until an evaluation decides it"
+    )
 
 
 class MapResponse(ResponseModel):
@@ -146,6 +169,11 @@ class MapResponse(ResponseModel):
         "GET /generations has the one of each generation",
     )
     auto_fit: bool = Field(description=AUTO_FIT)
+    matching: Matching = Field(description=MATCHING)
+    local_features: LocalFeaturesResponse | None = Field(
+        description="local features of the active generation; null before the first photo"
+    )
+    model_change_id: UUID | None = Field(description="job of the running model change")
     next_fit_photos: int | None = Field(
         description="number of photos from which the next vocabulary is fitted automatically; null "
         "if none is"
@@ -190,6 +218,7 @@ def create_new_map(
             place_labels_are_paths=body.place_labels_are_paths,
             row_type=body.rows or RowType(settings.descriptor_rows),
             auto_fit=body.auto_fit,
+            matching=body.matching,
         )
         response = _map_response(session, settings, map_)
         idempotent.store_response(session, 201, response)
@@ -205,12 +234,16 @@ def read_map(gateway: GatewayDep, name: MapNamePath) -> MapResponse:
 
 @router.patch("/maps/{name}", operation_id="update_map", dependencies=[WRITE, CHECK_MAP])
 def update_map(gateway: GatewayDep, name: MapNamePath, body: UpdateMapRequest) -> MapResponse:
-    """Change settings of the map: labels that are paths, stored descriptors, automatic fits.
+    """Change settings of the map: labels that are paths, stored descriptors, fits, matching.
 
     After a change of the labels, its estimates have no levels until the next evaluation, which
     starts by itself if automatic evaluations are on. A change of `rows` applies to generations that
     are created from now on: POST /generations creates one.
+
+    `matching: on` starts a model change (`model_change_id`) that computes missing local features
+    and keeps the descriptors, while searches continue; 409 while another model change runs.
     """
+    detector = gateway.settings.local_features
 
     def update(session: Session) -> MapResponse:
         map_ = lock_map(session, get_map(session, name).id)
@@ -224,10 +257,18 @@ def update_map(gateway: GatewayDep, name: MapNamePath, body: UpdateMapRequest) -
             map_.row_type = body.rows
         if body.auto_fit is not None:
             map_.auto_fit = body.auto_fit
+        if body.matching is not None:
+            map_.matching = body.matching
+        active = active_generation(session, map_.id)
+        is_on = body.matching == Matching.ON
+        if is_on and active and count_features(session, active.id, detector).missing:
+            start_reindex(session, active)
         session.flush()
         return _map_response(session, gateway.settings, map_)
 
-    return gateway.catalog.run(update)
+    response = gateway.catalog.run(update)
+    gateway.wakeups.send()
+    return response
 
 
 @router.delete("/maps/{name}", operation_id="delete_map", dependencies=[WRITE, CHECK_MAP])
@@ -253,6 +294,7 @@ def delete_map(gateway: GatewayDep, name: MapNamePath) -> DeletedMapResponse:
 
 def _map_response(session: Session, settings: Settings, map_: Map) -> MapResponse:
     generation = active_generation(session, map_.id)
+    change = get_unfinished_model_change(session, map_.id)
     statistics, counted_at = get_map_statistics(session, map_.id)
     return MapResponse.of_row(
         map_,
@@ -267,7 +309,22 @@ def _map_response(session: Session, settings: Settings, map_: Map) -> MapRespons
         vocabulary=vocabulary_standing(session, generation) if generation else None,
         dimension=generation.dimension if generation else None,
         pca_from=generation.pca_from if generation else None,
+        local_features=_local_features(session, settings, generation) if generation else None,
+        model_change_id=change.id if change else None,
         next_fit_photos=next_fit_photos(session, map_),
+    )
+
+
+def _local_features(
+    session: Session, settings: Settings, generation: Generation
+) -> LocalFeaturesResponse:
+    counts = count_features(session, generation.id, settings.local_features)
+    return LocalFeaturesResponse(
+        model=find_features_model(session, generation.id),
+        photos=counts.photos,
+        missing=counts.missing,
+        bytes=counts.size_bytes,
+        used=generation.uses_matches,
     )
 
 

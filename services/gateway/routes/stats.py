@@ -105,9 +105,10 @@ def read_stats(gateway: GatewayDep, query: MapQuery) -> StatsResponse:
         chunks, chunk_bytes = 0, 0
         if generation is not None:
             chunks, chunk_bytes = session.execute(
-                select(func.count(), func.coalesce(func.sum(Chunk.size_bytes), 0)).where(
-                    Chunk.generation_id == generation.id, Chunk.superseded_at.is_(None)
-                )
+                select(
+                    func.count(),
+                    func.coalesce(func.sum(Chunk.size_bytes + Chunk.features_bytes), 0),
+                ).where(Chunk.generation_id == generation.id, Chunk.superseded_at.is_(None))
             ).one()
         return StatsResponse.of_row(
             statistics,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import random
+from collections.abc import Sequence
 from dataclasses import asdict
 from uuid import UUID
 
@@ -25,7 +26,8 @@ from shared.catalog.photos import Photo
 from shared.errors import NotFound, Unavailable
 from shared.ids import new_id
 from shared.storage import ObjectStore
-from shared.storage.chunks import read_chunk, write_chunk
+from shared.storage.chunks import features_key, read_chunk, write_chunk
+from shared.storage.feature_files import FeatureRows, read_feature_file
 from shared.storage.read_retries import ReadRetries
 
 log = logging.getLogger(__name__)
@@ -104,6 +106,7 @@ def merge_slot(
             rows=matrix.astype(generation.row_type, copy=False),
             photo_ids=photo_ids,
             spec=generation.spec,
+            features=_merge_features(store, old, live_rows),
         )
     with catalog.write() as session:
         lock_map(session, generation.map_id)
@@ -143,6 +146,27 @@ def merge_slot(
         increment_map_version(session, generation.map_id)
     log.info("merged %d chunks of slot %d of generation %s", len(old), slot, generation_id)
     return True
+
+
+def _merge_features(
+    store: ObjectStore, chunks: list[Chunk], live_rows: dict[UUID, list[tuple[int, UUID]]]
+) -> FeatureRows | None:
+    """Return the local features of the live rows, of the model of the newest ones; None without.
+
+    Those of another model, and of a file that is damaged or missing, are dropped.
+    """
+    model = next((c.features_model for c in reversed(chunks) if c.features_model), None)
+    merged: list[bytes | memoryview] = []
+    for chunk in chunks:
+        rows: Sequence[bytes | memoryview] = [b""] * chunk.rows
+        if model and chunk.features_model == model:
+            key = features_key(chunk.object_key)
+            try:
+                rows = read_feature_file(store, key, chunk.features_sha256).rows
+            except (NotFound, ValueError) as error:
+                log.error("the local features %s are dropped: %s", key, error)
+        merged += [rows[row] for row, _ in live_rows[chunk.id]]
+    return FeatureRows(model, merged) if model else None
 
 
 def _slot_chunks(session: Session, generation_id: UUID, slot: int) -> list[Chunk]:

@@ -109,7 +109,7 @@ def test_a_crash_between_chunk_and_commit_leaves_an_orphan_that_is_collected(
         with pytest.raises(Killed):
             averages.drain()
     orphans = averages.keys("chunks/")
-    assert len(orphans) == 2  # rows and manifest
+    assert len(orphans) == 3  # rows, manifest and local features
     assert averages.rows() == {}
     assert reclaim_leases(averages.catalog) == 0  # the lease has to expire first
     expire_lease(averages.catalog, *(averages.job_of(p).id for p in photo_ids))
@@ -120,7 +120,7 @@ def test_a_crash_between_chunk_and_commit_leaves_an_orphan_that_is_collected(
     assert collect_orphans(averages.catalog, averages.store, DAY_SECONDS) == 0  # too young
     for key in live:
         _age(averages.store, key, 2 * DAY_SECONDS)
-    assert collect_orphans(averages.catalog, averages.store, DAY_SECONDS) == 2
+    assert collect_orphans(averages.catalog, averages.store, DAY_SECONDS) == 3
     assert averages.keys("") == live - orphans
     assert set(averages.rows()) == set(photo_ids)
 

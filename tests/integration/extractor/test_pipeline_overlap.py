@@ -84,7 +84,9 @@ def test_next_batch_is_described_while_one_is_published_and_the_one_after_waits(
     assert sorted(gate.seen) == ["describe 4"] * 3 + ["published 4"] * 3
     (result,) = results
     assert (result.claimed, result.succeeded, result.failed) == (12, 12, 0)
-    assert list(result.seconds) == ["read", "decode", "thumbnails", "describe", "publish"]
+    assert list(result.seconds) == [
+        *("read", "decode", "thumbnails", "describe", "features", "publish")
+    ]
     rows = averages.rows()
     for number, photo_id in enumerate(photo_ids):
         assert same(rows[photo_id], expected_row("test-tiny-avg", photo_bytes(number)))
