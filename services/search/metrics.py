@@ -14,7 +14,13 @@ from prometheus_client.registry import Collector
 
 from services.search.worker import SearchWorker
 from shared.errors import PlacewiseError
-from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
+from shared.search_api.protocol import (
+    MatchRequest,
+    MatchResponse,
+    SearchRequest,
+    SearchResponse,
+    SearchStatus,
+)
 from shared.telemetry.tracing import span
 
 METRIC_PREFIX = "placewise_search"
@@ -54,6 +60,17 @@ class MeteredSearch:
             "Largest error of a response's sign-code estimates, in standard deviations.",
             buckets=MAX_Z_BUCKETS,
         )
+        self._matches = counter(
+            "matches", "Match requests by outcome: answered, or the error code.", ["outcome"]
+        )
+        self._match_seconds = histogram(
+            "match_seconds",
+            "Duration of successful match requests in seconds.",
+            buckets=LATENCY_BUCKETS,
+        )
+        self._matched_photos = counter(
+            "matched_photos", "Photos by result: matched or without_features.", ["result"]
+        )
         self._registry.register(_SnapshotCollector(worker))
 
     def search(self, request: SearchRequest) -> SearchResponse:
@@ -66,6 +83,22 @@ class MeteredSearch:
             self._searches.labels(error.code).inc()
             raise
         self._observe(response, time.perf_counter() - started)
+        return response
+
+    def match(self, request: MatchRequest) -> MatchResponse:
+        """Match and record the metrics of the response."""
+        started = time.perf_counter()
+        try:
+            with span("match", photos=len(request.candidates)):
+                response = self._worker.match(request)
+        except PlacewiseError as error:
+            self._matches.labels(error.code).inc()
+            raise
+        self._matches.labels("answered").inc()
+        self._match_seconds.observe(time.perf_counter() - started)
+        matched = sum(each is not None for each in response.candidates)
+        self._matched_photos.labels("matched").inc(matched)
+        self._matched_photos.labels("without_features").inc(len(request.candidates) - matched)
         return response
 
     def status(self) -> SearchStatus:

@@ -1,4 +1,4 @@
-"""Search service process: syncs with the catalog, sends heartbeats, and serves `POST /search`.
+"""Search service process: syncs with the catalog, sends heartbeats, and serves searches over HTTP.
 
 The HTTP API is for the gateway and the steward only. It requires no API key and exposes which
 photos a map has: listen on an internal network. `WorkerHeartbeat` registers the worker in the
@@ -33,7 +33,14 @@ from shared.catalog.processes import delete_search_worker, upsert_search_worker
 from shared.config.settings import Settings
 from shared.http.problem_details import PROBLEM_RESPONSES, install_exception_handlers
 from shared.ids import new_id
-from shared.search_api.protocol import ReplicationLag, SearchRequest, SearchResponse, SearchStatus
+from shared.search_api.protocol import (
+    MatchRequest,
+    MatchResponse,
+    ReplicationLag,
+    SearchRequest,
+    SearchResponse,
+    SearchStatus,
+)
 from shared.telemetry.metrics_server import METRICS_CONTENT_TYPE, serve_metrics
 
 log = logging.getLogger(__name__)
@@ -60,7 +67,8 @@ def create_search_app(worker: SearchWorker, registry: CollectorRegistry | None =
     """Create the HTTP API of a worker, which the caller keeps in sync with the catalog."""
     app = FastAPI(
         title="Placewise search",
-        description=f"Exact cosine top-k on shard {worker.shard} of every map.",
+        description=f"Exact cosine top-k on shard {worker.shard} of every map, and matches of "
+        "local features.",
         responses=PROBLEM_RESPONSES,
     )
     install_exception_handlers(app)
@@ -72,6 +80,11 @@ def create_search_app(worker: SearchWorker, registry: CollectorRegistry | None =
         """Search this shard for the rows that are most similar to the referenced one."""
         # Serialised here, because FastAPI would validate the response again.
         return Response(metrics.search(request).model_dump_json(), media_type="application/json")
+
+    @app.post("/match", operation_id="match", response_model=MatchResponse)
+    def match(request: MatchRequest) -> Response:
+        """Match the local features of a query with those of photos of any shard."""
+        return Response(metrics.match(request).model_dump_json(), media_type="application/json")
 
     # Async like the probes, so that it answers while all threads of the pool are searching.
     @app.get("/status", operation_id="status", response_model=SearchStatus)

@@ -29,6 +29,7 @@ from services.search.catalog_sync import (
 from services.search.chunk_loader import list_generation_folders, remove_stale_folders
 from services.search.executor import SearchOptions, execute_query
 from services.search.photo_columns import build_row_mask
+from services.search.photo_matcher import PhotoMatcher
 from services.search.query_batcher import QueryBatcher
 from services.search.residency import MemoryBudget, open_search_gpu
 from services.search.snapshot import Snapshot
@@ -40,6 +41,8 @@ from shared.config.shards import SINGLE_SHARD, Shard
 from shared.errors import Gone, InvalidRequest, NotFound, Unavailable
 from shared.search_api.background import subtract_background
 from shared.search_api.protocol import (
+    MatchRequest,
+    MatchResponse,
     RowReference,
     SearchRequest,
     SearchResponse,
@@ -183,6 +186,7 @@ class SearchWorker:
         self.query_batcher = QueryBatcher()
         self._memory_budget = MemoryBudget(settings.search_memory_bytes)
         self._query_rows = QueryRowReader(store)
+        self._photo_matcher = PhotoMatcher(store)
         self._snapshots: dict[UUID, Snapshot] = {}
         self._snapshots_lock = threading.Lock()  # never held during I/O
         self._load_locks: dict[UUID, threading.Lock] = {}
@@ -263,6 +267,10 @@ class SearchWorker:
         options = SearchOptions(request.k, request.min_score, request.mode)
         weighted = _weight_query(query, request.word_weights)
         return execute_query(snapshot, query, row_mask, options, self.query_batcher, weighted)
+
+    def match(self, request: MatchRequest) -> MatchResponse:
+        """Match local features, of photos of any shard; see `MatchRequest`."""
+        return self._photo_matcher.match(request)
 
     def status(self) -> SearchStatus:
         """Return what is loaded, with sizes and lags."""

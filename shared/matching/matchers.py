@@ -14,6 +14,9 @@ MIN_COSINES = {"xfeat": 0.82, "aliked-n16": 0.7}
 """Least cosine of a match by detector; XFeat's is that of its authors."""
 DEFAULT_MIN_COSINE = 0.8
 
+MAX_BLOCK_PRODUCTS = 1 << 18
+"""Larger products of matrices are computed in several threads by OpenBLAS"""
+
 Matches = NDArray[np.intp]
 """(m, 2) numbers of the keypoints in the first and in the second photo"""
 
@@ -40,7 +43,7 @@ class MutualNearest:
         """Return the mutual nearest pairs, most similar first."""
         if not len(first.descriptors) or not len(second.descriptors):
             return np.empty((0, 2), dtype=np.intp)
-        products = first.descriptors.astype(np.float32) @ second.descriptors.T.astype(np.float32)
+        products = _multiply(first.descriptors, second.descriptors)
         nearest = products.argmax(axis=1)
         numbers = np.arange(len(nearest))
         is_mutual = products.argmax(axis=0)[nearest] == numbers
@@ -48,3 +51,16 @@ class MutualNearest:
         chosen = np.flatnonzero(is_mutual & (cosines > self.min_cosine))
         chosen = chosen[np.argsort(-cosines[chosen], kind="stable")]
         return np.column_stack([chosen, nearest[chosen]])
+
+
+def _multiply(first: NDArray[np.int8], second: NDArray[np.int8]) -> NDArray[np.float32]:
+    """Return the (n, m) products of (n, D) and (m, D) rows, exactly: all sums are below 2^24.
+
+    In blocks of one thread each: pairs of photos are matched in several threads, in which the
+    threads of OpenBLAS would wait for each other.
+    """
+    rows = max(1, MAX_BLOCK_PRODUCTS // second.size)
+    padded = np.pad(first, ((0, -len(first) % rows), (0, 0))).astype(np.float32)
+    blocks = padded.reshape(-1, rows, first.shape[1]) @ second.T.astype(np.float32)
+    products: NDArray[np.float32] = blocks.reshape(len(padded), len(second))[: len(first)]
+    return products

@@ -11,7 +11,7 @@ import heapq
 import logging
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextvars import copy_context
 from functools import partial
@@ -27,6 +27,8 @@ from shared.errors import Misconfigured, PlacewiseError, Unavailable, error_from
 from shared.search_api.protocol import (
     CERTIFICATES,
     NONE,
+    MatchRequest,
+    MatchResponse,
     SearchHit,
     SearchRequest,
     SearchResponse,
@@ -191,6 +193,17 @@ class HttpSearchClient:
             )
         return merge_responses(responses, request.k, unreachable)
 
+    def match(self, request: MatchRequest) -> MatchResponse:
+        """Match local features on one worker; on the next one when it fails."""
+        deadline = time.monotonic() + self._timeout_seconds
+        for url, seconds in _attempts(self._workers.urls(), deadline):
+            try:
+                return call_match(self._http, url, request, seconds)
+            except WorkerUnavailable as error:
+                log.info("a match request failed, trying the next worker: %s", error)
+                self._workers.mark_down(url)
+        raise Unavailable("search_unavailable", "No search worker answers. Retry in a moment.")
+
     def status(self) -> SearchStatus:
         """Poll the workers and merge their states.
 
@@ -228,14 +241,7 @@ class HttpSearchClient:
         while True:
             retry = False
             unreadable: Unavailable | None = None
-            # A lone worker gets a second attempt: the kept-alive connection may have been stale.
-            order = list(urls) if len(urls) != 1 else [urls[0], urls[0]]
-            for url in order:
-                remaining = deadline - time.monotonic()
-                if remaining <= 0:
-                    break
-                # Only the last worker may use up the whole remaining time.
-                seconds = remaining if url == order[-1] else remaining / 2
+            for url, seconds in _attempts(urls, deadline):
                 try:
                     return call_search(self._http, url, request, seconds)
                 except WorkerUnavailable as error:
@@ -253,6 +259,18 @@ class HttpSearchClient:
                 # A worker that lagged and then timed out is reported as lagging.
                 raise behind or WorkerUnavailable(shard.name, "no worker answers")
             time.sleep(RETRY_PAUSE_SECONDS)
+
+
+def _attempts(urls: Sequence[str], deadline: float) -> Iterator[tuple[str, float]]:
+    """Yield the workers to call, each with its timeout in seconds, until the deadline."""
+    # A lone worker gets a second attempt: the kept-alive connection may have been stale.
+    order = list(urls) if len(urls) != 1 else [urls[0], urls[0]]
+    for url in order:
+        remaining = deadline - time.monotonic()
+        if remaining <= 0:
+            return
+        # Only the last worker may use up the whole remaining time.
+        yield url, remaining if url == order[-1] else remaining / 2
 
 
 def _collect(
@@ -295,6 +313,14 @@ def call_search(
     """
     body = _call(http, "POST", f"{url}/search", timeout_seconds, content=request.model_dump_json())
     return _read(SearchResponse, url, body)
+
+
+def call_match(
+    http: httpx2.Client, url: str, request: MatchRequest, timeout_seconds: float
+) -> MatchResponse:
+    """Call `POST /match` of one worker; raises as `call_search` does."""
+    body = _call(http, "POST", f"{url}/match", timeout_seconds, content=request.model_dump_json())
+    return _read(MatchResponse, url, body)
 
 
 def fetch_status(

@@ -127,6 +127,13 @@ class WorkerDirectory:
                 for shard in _shards_of(best)
             }
 
+    def urls(self) -> list[str]:
+        """Return the URLs of all workers of any shard, best first."""
+        with self._lock:
+            workers = random.sample(self._workers, len(self._workers))
+            workers.sort(key=lambda worker: (not worker.is_up, worker.silent))
+            return [worker.url for worker in workers]
+
     def statuses(self) -> tuple[dict[Shard, SearchStatus], list[Shard]]:
         """Return the state of each shard's most advanced worker, and the shards without one."""
         with self._lock:

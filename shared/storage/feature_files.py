@@ -30,6 +30,8 @@ from shared.storage.protocol import read_up_to
 
 MAGIC = b"PWF1"
 MAX_HEADER_BYTES = 4096
+MAX_ROWS = 1 << 24
+MAX_ROW_BYTES = 1 << 22
 _START = struct.Struct("<4sI")
 
 
@@ -45,6 +47,13 @@ class FeatureIndex:
     @property
     def rows(self) -> int:
         return len(self.offsets) - 1
+
+    def row_range(self, row: int) -> tuple[int, int]:
+        """Return where a row begins and ends; an empty range if there is no such row."""
+        if row >= self.rows:
+            return 0, 0
+        begin, end = self.offsets[row : row + 2].tolist()
+        return begin, end
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,10 +94,11 @@ def _read_index(file: BinaryIO, key: str) -> FeatureIndex:
     try:
         header = json.loads(read_up_to(file, size))
         model, rows = str(header["model"]), int(header["rows"])
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"the header of {key} is damaged") from error
-    offsets = np.frombuffer(read_up_to(file, 8 * (rows + 1)), "<u8")
-    if len(offsets) != rows + 1 or (np.diff(offsets.astype(np.int64)) < 0).any():
+    offsets = np.frombuffer(read_up_to(file, 8 * (min(rows, MAX_ROWS) + 1)), "<u8")
+    sizes = np.diff(offsets.astype(np.int64))
+    if len(sizes) != rows or ((sizes < 0) | (sizes > MAX_ROW_BYTES)).any():
         raise ValueError(f"the offsets of {key} are damaged")
     return FeatureIndex(model, offsets)
 
@@ -105,9 +115,7 @@ def read_feature_rows(
     found = {}
     with store.open(key) as file:
         for row in sorted(set(rows)):
-            if row >= index.rows:
-                continue
-            begin, end = index.offsets[row : row + 2].tolist()
+            begin, end = index.row_range(row)
             if begin == end:
                 continue
             file.seek(begin)

@@ -24,7 +24,14 @@ from shared.catalog.maps import DEFAULT_MAP
 from shared.config.settings import Settings
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
-from shared.search_api.protocol import SearchBackend, SearchRequest, SearchResponse, SearchStatus
+from shared.search_api.protocol import (
+    MatchRequest,
+    MatchResponse,
+    SearchBackend,
+    SearchRequest,
+    SearchResponse,
+    SearchStatus,
+)
 from shared.storage import FolderStore
 from tests.support.catalog_rows import add_chunk, add_generation, add_map, add_photo, read_job
 
@@ -125,6 +132,9 @@ class Watched:
         if self.searches == self.at:
             self.do()
         return self.port.search(request)
+
+    def match(self, request: MatchRequest) -> MatchResponse:
+        return self.port.match(request)
 
     def status(self) -> SearchStatus:
         return self.port.status()

@@ -14,7 +14,13 @@ from services.steward.tasks.garbage_collection import collect_superseded_chunks
 from shared.catalog.chunks import Descriptor
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import Map
-from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
+from shared.search_api.protocol import (
+    MatchRequest,
+    MatchResponse,
+    SearchRequest,
+    SearchResponse,
+    SearchStatus,
+)
 from tests.integration.steward.streets import HOUR, NOON, STREETS, WITHOUT_PLACE, at, query
 from tests.integration.town import Town, Watched
 from tests.support.catalog_rows import delete, read_job
@@ -139,6 +145,9 @@ def queried_photos(town: Town, **params: Any) -> list[UUID]:
         def search(self, request: SearchRequest) -> SearchResponse:
             seen.update(dict.fromkeys(request.exclude))
             return search(request)
+
+        def match(self, request: MatchRequest) -> MatchResponse:
+            return town.search.match(request)
 
         def status(self) -> SearchStatus:
             return town.search.status()

@@ -31,7 +31,14 @@ from shared.ids import new_id
 from shared.jobs import InProcessWakeups, Job, JobState, claim_jobs, extend_lease, mark_started
 from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.transitions import requeue_job
-from shared.search_api.protocol import SearchHit, SearchRequest, SearchResponse, SearchStatus
+from shared.search_api.protocol import (
+    MatchRequest,
+    MatchResponse,
+    SearchHit,
+    SearchRequest,
+    SearchResponse,
+    SearchStatus,
+)
 from shared.storage import FolderStore
 from tests.integration.operations.query_plans.explain import Explainer
 from tests.integration.operations.query_plans.fill import LARGEST_MAP, SyntheticCatalog
@@ -61,6 +68,9 @@ class _FakeSearch:
             snapshot_version=request.min_version,
             missing=(),
         )
+
+    def match(self, request: MatchRequest) -> MatchResponse:
+        return MatchResponse(candidates=(None,) * len(request.candidates))
 
     def status(self) -> SearchStatus:
         return SearchStatus(shard="0/1", rows=0, resident_bytes=0, versions={}, missing=())
