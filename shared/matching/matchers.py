@@ -61,6 +61,6 @@ def _multiply(first: NDArray[np.int8], second: NDArray[np.int8]) -> NDArray[np.f
     """
     rows = max(1, MAX_BLOCK_PRODUCTS // second.size)
     padded = np.pad(first, ((0, -len(first) % rows), (0, 0))).astype(np.float32)
-    blocks = padded.reshape(-1, rows, first.shape[1]) @ second.T.astype(np.float32)
+    blocks = padded.reshape(-1, rows, first.shape[1]) @ np.ascontiguousarray(second.T, np.float32)
     products: NDArray[np.float32] = blocks.reshape(len(padded), len(second))[: len(first)]
     return products
