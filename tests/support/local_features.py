@@ -8,7 +8,7 @@ from shared.ids import new_id
 from shared.matching.features import LocalFeatures
 from shared.search_api.protocol import FeatureReference
 from shared.storage import ObjectStore
-from shared.storage.feature_files import encode_feature_file
+from shared.storage.feature_files import FeatureRows, encode_feature_file
 
 MODEL = "xfeat@0123456789ab"
 SIZE = (1280, 960)
@@ -36,6 +36,11 @@ def put_features(
 ) -> list[FeatureReference]:
     """Store a feature file of these photos; None is a row without features."""
     key = key or f"chunks/{new_id()}/{new_id()}.features"
+    store.put(key, encode_feature_file(feature_rows(*photos, model=model)))
+    return [FeatureReference(object_key=key, row=row) for row in range(len(photos))]
+
+
+def feature_rows(*photos: LocalFeatures | None, model: str = MODEL) -> FeatureRows:
+    """Return the rows of a feature file; None is one without features."""
     rows = [b"" if features is None else features.encode() for features in photos]
-    store.put(key, encode_feature_file(model, rows))
-    return [FeatureReference(object_key=key, row=row) for row in range(len(rows))]
+    return FeatureRows(model, rows)
