@@ -23,8 +23,9 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -43,7 +44,12 @@ from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, Ran
 from shared.evaluation.places.fit import PlaceSample, fit_place_model
 from shared.evaluation.places.levels import LevelScheme, candidate_levels
 from shared.evaluation.places.probability import PlaceEstimate, PlaceModel
-from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
+from shared.evaluation.places.samples import (
+    IndexRanking,
+    MatchOwnPhoto,
+    OwnPhotoSampler,
+    attach_matches,
+)
 from shared.place_paths import label_levels
 
 CERTAINTY = 0.95
@@ -66,6 +72,8 @@ class DescribedPhotos:
     """(n,) clusters of the bootstrap"""
     scheme: LevelScheme
     radius_m: float
+    match: MatchOwnPhoto | None = None
+    """compares photos of the set; None for estimates without matches"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,6 +183,8 @@ def describe_set(folder: Path, progress: Progress) -> DescribedPhotos:
 class TrialMap:
     """A map of some of the photos of a set, searched in memory.
 
+    The model is fitted with matches where the set has them.
+
     Args:
         photos: The set.
         in_map: (n,) which of its photos are in the map.
@@ -198,13 +208,23 @@ class TrialMap:
         """Return the samples of the map's photos, and their unit of score differences."""
         own = range(len(self.members))
         spread = self.own_photos.spread(own)
-        return list(self.own_photos.samples(own, spread)), spread
+        match = self.match if self.photos.match else None
+        return list(self.own_photos.samples(own, spread, match)), spread
+
+    def match(self, photo: int, candidates: Sequence[Any]) -> Sequence[float | None]:
+        """Return the match support of one photo of the map with others."""
+        return self._match(self.members[photo], candidates)
+
+    def _match(self, photo: int, candidates: Sequence[Any]) -> Sequence[float | None]:
+        assert self.photos.match is not None
+        return self.photos.match(photo, [self.members[number] for number in candidates])
 
     def fit(self, labelled: Sequence[int] = ()) -> PlaceModel:
         """Fit the place model on the map's photos, and on photos of the set as labelled queries."""
         samples, spread = self.own_samples()
         labels = [sample for q in labelled if (sample := self.query_sample(q, spread)).levels]
-        return fit_place_model(samples, labels, self.photos.scheme, spread).model
+        model = fit_place_model(samples, labels, self.photos.scheme, spread).model
+        return model.model_copy(update={"with_matches": model}) if self.photos.match else model
 
     def estimate(self, query: int, model: PlaceModel) -> PlaceEstimate | None:
         """Estimate the place of a photo of the set; None without similar photos of known place."""
@@ -218,6 +238,8 @@ class TrialMap:
             RankedPhoto(score, self.locations[index], index)
             for index, score in zip(found[:EVIDENCE_DEPTH].tolist(), scores.tolist(), strict=False)
         ]
+        if self.photos.match:
+            ranking = attach_matches(ranking, partial(self._match, query))
         return ranking, self.own_photos.neighbours(int(found[0]))
 
     def query_sample(self, query: int, spread: float) -> PlaceSample:

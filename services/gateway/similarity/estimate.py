@@ -7,8 +7,8 @@ from uuid import UUID
 
 from services.gateway.schemas import EstimateLevelResponse, EstimateResponse
 from shared.catalog.photos import Photo
-from shared.evaluation.places.evidence import PhotoLocation, RankedPhoto, estimate_location
-from shared.evaluation.places.probability import PlaceEstimate, PlaceModel
+from shared.evaluation.places.evidence import PhotoLocation, RankedPhoto
+from shared.evaluation.places.probability import PlaceEstimate
 from shared.search_api.protocol import SearchHit
 
 MIN_GUESS_PROBABILITY = 0.1  # of the finest level; a less probable place is not named as a guess
@@ -27,30 +27,25 @@ def locate_hits(hits: Sequence[SearchHit], photos: Mapping[UUID, Photo]) -> list
 
 
 def estimate_place(
-    ranking: Sequence[RankedPhoto],
     estimate: PlaceEstimate | None,
-    model: PlaceModel,
     certainty: float,
     radius_m: float,
     no_place_reason: str,
 ) -> EstimateResponse:
     """Return the place that a ranking points to, and how certain it is.
 
+    Before the map's first evaluation, the place is named without probabilities.
+
     Args:
-        ranking: The photos that have a place and match the filter, best first.
-        estimate: The model's estimate for them; None if the best one has no location.
-        model: That of this kind of ranking (plain, or by word weights). Before the map's first
-            evaluation, the place is named without probabilities.
+        estimate: The model's estimate; None if the best photo has no location.
         certainty: Share of the answers that must be right.
         radius_m: Photos within this distance in metres of the best one determine the position.
         no_place_reason: The reason if there is no estimate.
     """
     if estimate is None:
         return EstimateResponse(reason=no_place_reason)
-    in_map = estimate.in_map
-    spot = (
-        PhotoLocation(None, None, None) if in_map is False else estimate_location(ranking, radius_m)
-    )
+    in_map, model = estimate.in_map, estimate.model
+    spot = PhotoLocation(None, None, None) if in_map is False else estimate.location
     response = EstimateResponse(
         in_map=in_map,
         latitude=spot.latitude,
@@ -84,12 +79,13 @@ def estimate_place(
             "radius_68_m": estimate.radius_68_m,
             "radius_95_m": estimate.radius_95_m,
             "calibration_source": model.calibration_source,
-            "reason": _reason(estimate, model),
+            "reason": _reason(estimate),
         }
     )
 
 
-def _reason(estimate: PlaceEstimate, model: PlaceModel) -> str:
+def _reason(estimate: PlaceEstimate) -> str:
+    model = estimate.model
     if model.in_map_limit is None:
         return "Too few photos were evaluated to tell whether the place is in the map."
     compared = (

@@ -249,9 +249,7 @@ def run_similarity_search(
         located.ranking,
     )
     estimate = estimate_place(
-        located.ranking,
         places,
-        model,
         certainty,
         settings.estimate_radius_m,
         _no_place_reason(found.hits, photo_filter),

@@ -6,7 +6,7 @@ Two photos show the same place if they are close to each other or have the same 
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -59,8 +59,31 @@ class RankedPhoto:
     location: PhotoLocation
     photo: Hashable = None
     """identifies the photo in other rankings of the same map; None if it is not known"""
-    inliers: int | None = None
-    """verified matches of its local features with the query's; None if they were not compared"""
+    support: float | None = None
+    """`match_support` of its local features and the query's; None if they were not compared"""
+
+
+MATCHED_PHOTOS = 10  # first ranks whose matches are evidence
+
+
+def match_support(matches: int, inliers: int) -> float:
+    """Return how much the matches of two photos say that they show the same place.
+
+    The number of inliers times their share of the matches: places that look alike have many
+    matches, of which fewer agree with one camera motion.
+    """
+    return inliers * inliers / max(1, matches)
+
+
+def without_matches(ranking: Sequence[RankedPhoto]) -> list[RankedPhoto]:
+    """Return the ranking as if no photo had been compared with the query."""
+    return [replace(r, support=None) for r in ranking]
+
+
+def are_matched(ranking: Sequence[RankedPhoto]) -> bool:
+    """Return whether the first MATCHED_PHOTOS of a ranking were compared with the query."""
+    first = ranking[:MATCHED_PHOTOS]
+    return bool(first) and all(r.support is not None for r in first)
 
 
 def estimate_location(ranking: Sequence[RankedPhoto], radius_m: float) -> PhotoLocation:

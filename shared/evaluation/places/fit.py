@@ -21,12 +21,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared.evaluation.places.levels import FEATURES, CandidateLevel, FloatArray, LevelScheme
+from shared.evaluation.places.levels import CandidateLevel, FloatArray, LevelScheme
 from shared.evaluation.places.probability import (
     OUT_OF_MAP_SHARE,
     Coefficients,
     PlaceModel,
     PlacePrior,
+    extended,
     shipped_prior,
     sigmoid,
 )
@@ -147,7 +148,7 @@ class RegressionTable:
         """Make a table of (features, target, weight) rows."""
         columns = list(zip(*rows, strict=True)) or [(), (), ()]
         return cls(
-            np.array(columns[0], dtype=np.float64).reshape(-1, len(FEATURES)),
+            np.array(columns[0], dtype=np.float64),
             np.array(columns[1], dtype=np.float64),
             np.array(columns[2], dtype=np.float64),
         )
@@ -197,8 +198,10 @@ def fit_map_estimate(
         prior: Standardises the features; the shipped prior by default.
         precision: Precision of the Gaussian prior of each coefficient.
     """
+    if not len(table.target):
+        return center
     design = (prior or shipped_prior()).design(table.features)
-    mean = np.array(center)
+    mean = extended(center, design.shape[1])
     beta = mean.copy()
 
     def loss(beta: FloatArray) -> float:
@@ -206,7 +209,7 @@ def fit_map_estimate(
         fit = float(table.weights @ np.logaddexp(0.0, -margin))
         return fit + precision / 2 * float(((beta - mean) ** 2).sum())
 
-    for _ in range(NEWTON_STEPS if len(design) else 0):
+    for _ in range(NEWTON_STEPS):
         probability = sigmoid(design @ beta)
         gradient = design.T @ (table.weights * (table.target - probability))
         gradient -= precision * (beta - mean)

@@ -11,6 +11,9 @@ them compare the query with the *neighbours* of the best photo, the photos of th
 similar to it: a query that is less similar to it than many of its neighbours are was probably taken
 elsewhere (local density, as in the local outlier factor of Breunig et al. 2000), and so was one
 that finds other photos than it does (shared neighbours, Jarvis and Patrick 1973).
+
+Where the local features of the first photos were matched with the query's, their matches vote for
+the place, too, and each level has MATCH_FEATURES in addition.
 """
 
 from __future__ import annotations
@@ -23,9 +26,11 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from shared.evaluation.places.evidence import (
+    MATCHED_PHOTOS,
     VOTING_PHOTOS,
     PhotoLocation,
     RankedPhoto,
+    are_matched,
     distance_between_m,
     estimate_location,
 )
@@ -35,6 +40,7 @@ from shared.place_paths import is_within_level, label_levels
 VOTE_TEMPERATURE = 0.1  # of the softmax over scores, in units of the spread
 SHARED_DEPTHS = (5, 10, 20)  # first ranks whose photos are compared with the best photo's
 WIDE_TEMPERATURE = 0.3
+SUPPORT_PER_VOTE = 10.0  # match support that weighs as much as the vote of the best photo
 MIN_SHARE = 1e-3  # of the votes; bounds the log-odds of a level that has all votes or none
 MIN_SPREAD = 1e-6
 
@@ -62,7 +68,7 @@ class CandidateLevel:
     longitude: float | None = None
     radius_m: float | None = None
     features: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """(len(FEATURES),)"""
+    """(F,) FEATURES, followed by MATCH_FEATURES if the ranking was matched"""
 
     def contains(self, location: PhotoLocation) -> bool:
         """Return whether a location lies in the level."""
@@ -115,6 +121,7 @@ def candidate_levels(
     found = ranking if found is None else found
     if not ranking or not found:
         return []
+    found = order_by_matches(found, spread)
     if scheme.labels_are_paths or found[0].location.latitude is None:
         levels = _vote_for_places(found, scheme.labels_are_paths, spread)
     else:
@@ -125,20 +132,21 @@ def candidate_levels(
         ]
     scores, neighbour_scores = _scores(ranking), _scores(neighbours)
     shared = shared_neighbours(ranking, neighbours)
-    return [
-        replace(
-            level,
-            features=level_features(
-                scores,
-                photos_inside(level, ranking),
-                neighbour_scores,
-                photos_inside(level, neighbours),
-                shared,
-                spread,
-            ),
+    matched, described = are_matched(ranking), []
+    for level in levels:
+        features = level_features(
+            scores,
+            photos_inside(level, ranking),
+            neighbour_scores,
+            photos_inside(level, neighbours),
+            shared,
+            spread,
         )
-        for level in levels
-    ]
+        if matched:
+            of_matches = match_features(level, ranking[:MATCHED_PHOTOS])
+            features = np.concatenate([features, of_matches])
+        described.append(replace(level, features=features))
+    return described
 
 
 def shared_neighbours(
@@ -163,7 +171,7 @@ def _vote_for_places(
     those of photos whose labels end at a level, the estimate ends there, too.
     """
     paths = [label_levels(r.location.place, is_path)[::-1] for r in ranking]
-    votes = vote_weights(ranking, spread).tolist()
+    votes = place_vote_weights(ranking, spread).tolist()
     chosen: list[CandidateLevel] = []
     voters = [index for index, path in enumerate(paths) if path]
     while True:
@@ -293,6 +301,41 @@ def level_features(
     return np.array(features, dtype=np.float64)
 
 
+MATCH_FEATURES = (
+    "best_support_inside",
+    "best_support_outside",
+    "best_support_ratio",
+    "support_share",
+    "support_inside",
+)
+"""Names of the features of matches, in the order of `match_features`."""
+SUPPORT_UNIT = 100.0  # of the features; they are not standardised by the prior
+SUPPORT_OFFSET = 8.0  # matches that two photos of different places have by chance
+
+
+def match_features(level: CandidateLevel, ranking: Sequence[RankedPhoto]) -> FloatArray:
+    """Compute the features of a level by the matches of the first photos.
+
+    Returns:
+        (len(MATCH_FEATURES),) float64: the largest match support of a photo inside, and outside;
+        half the logarithm of their ratio, and of that of all support inside and outside; all
+        support inside.
+    """
+    support = np.array([r.support or 0.0 for r in ranking])
+    inside = photos_inside(level, ranking)
+    best, rival = support[inside].max(initial=0), support[~inside].max(initial=0)
+    total, rest = support[inside].sum(), support[~inside].sum()
+    return np.array(
+        [
+            best / SUPPORT_UNIT,
+            rival / SUPPORT_UNIT,
+            np.log((best + SUPPORT_OFFSET) / (rival + SUPPORT_OFFSET)) / 2,
+            np.log((total + SUPPORT_OFFSET) / (rest + SUPPORT_OFFSET)) / 2,
+            total / (4 * SUPPORT_UNIT),
+        ]
+    )
+
+
 def ranking_spread(ranking: Sequence[RankedPhoto]) -> float:
     """Return the difference between the first and the last score, at least MIN_SPREAD."""
     return max(MIN_SPREAD, ranking[0].score - ranking[-1].score) if ranking else MIN_SPREAD
@@ -301,6 +344,18 @@ def ranking_spread(ranking: Sequence[RankedPhoto]) -> float:
 def vote_weights(ranking: Sequence[RankedPhoto], spread: float) -> FloatArray:
     """Return the weight of each photo's vote, 1 for the best."""
     return _votes(_scores(ranking), VOTE_TEMPERATURE * spread)
+
+
+def order_by_matches(ranking: Sequence[RankedPhoto], spread: float) -> list[RankedPhoto]:
+    """Return a ranking by score and matches; one without matches stays as it is."""
+    order = np.argsort(-place_vote_weights(ranking, spread), kind="stable")
+    return [ranking[index] for index in order.tolist()]
+
+
+def place_vote_weights(ranking: Sequence[RankedPhoto], spread: float) -> FloatArray:
+    """Return the weight of each photo's vote for a place: by its score, and by its matches."""
+    support = np.array([r.support or 0.0 for r in ranking])
+    return vote_weights(ranking, spread) + support / SUPPORT_PER_VOTE
 
 
 def _scores(ranking: Sequence[RankedPhoto]) -> FloatArray:

@@ -18,12 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from shared.evaluation.places.evidence import EVIDENCE_DEPTH, RankedPhoto
+from shared.evaluation.places.evidence import (
+    EVIDENCE_DEPTH,
+    PhotoLocation,
+    RankedPhoto,
+    are_matched,
+    estimate_location,
+    without_matches,
+)
 from shared.evaluation.places.levels import (
     CandidateLevel,
     FloatArray,
     LevelScheme,
     candidate_levels,
+    order_by_matches,
     photos_inside,
     place_votes,
     ranking_spread,
@@ -53,9 +61,11 @@ class PlacePrior(BaseModel):
     """log-odds if half of the queries are from outside the map"""
 
     def design(self, features: FloatArray) -> FloatArray:
-        """Return the (n, 1 + F) design matrix of (n, F) features."""
-        standardised = (features - np.array(self.means)) / np.array(self.scales)
-        return np.column_stack([np.ones(len(features)), standardised])
+        """Return the (n, 1 + F) design matrix of (n, F) features; those of matches stay as they
+        are."""
+        known = len(self.means)
+        standardised = (features[:, :known] - np.array(self.means)) / np.array(self.scales)
+        return np.column_stack([np.ones(len(features)), standardised, features[:, known:]])
 
 
 @cache
@@ -68,6 +78,10 @@ def shipped_prior() -> PlacePrior:
 class PlaceEstimate:
     """Probabilities of an estimate."""
 
+    model: PlaceModel
+    """that was used: with or without matches"""
+    location: PhotoLocation
+    """of the best photos: their position, and the label of the first"""
     levels: Sequence[CandidateLevel]
     """finest first"""
     probabilities: Sequence[float]
@@ -104,6 +118,8 @@ class PlaceModel(BaseModel):
     """queries with a lower probability of "not in the map" show a place of the map"""
     own_photos: int = 0
     labelled_queries: int = 0
+    with_matches: PlaceModel | None = None
+    """the model of queries whose first photos were matched; None if matches do not help the map"""
 
     @property
     def is_fitted(self) -> bool:
@@ -179,8 +195,11 @@ class PlaceModel(BaseModel):
         Returns:
             The estimate; None if the ranking has no location.
         """
-        evidence, unit = ranking[:EVIDENCE_DEPTH], self.unit(ranking[:EVIDENCE_DEPTH])
         shown = ranking if found is None else found
+        model = self.with_matches if are_matched(ranking) and self.with_matches else self
+        if model is self:
+            ranking, shown = without_matches(ranking), without_matches(shown)
+        evidence, unit = ranking[:EVIDENCE_DEPTH], model.unit(ranking[:EVIDENCE_DEPTH])
         levels = candidate_levels(
             evidence,
             neighbours[:EVIDENCE_DEPTH],
@@ -191,13 +210,16 @@ class PlaceModel(BaseModel):
         )
         if not levels:
             return None
-        probabilities, not_in_map = self.probabilities(levels)
+        probabilities, not_in_map = model.probabilities(levels)
+        ordered = order_by_matches(shown[:EVIDENCE_DEPTH], unit)
         return PlaceEstimate(
+            model=model,
+            location=estimate_location(ordered, position_radius_m),
             levels=levels,
             probabilities=probabilities,
-            answer=self.answer(probabilities, not_in_map, certainty),
+            answer=model.answer(probabilities, not_in_map, certainty),
             not_in_map=not_in_map,
-            in_map=self._is_in_map(not_in_map),
+            in_map=model._is_in_map(not_in_map),
             radius_68_m=error_radius_m(levels, probabilities, 0.68),
             radius_95_m=error_radius_m(levels, probabilities, 0.95),
             match_probabilities=_match_probabilities(
@@ -249,7 +271,12 @@ def _match_probabilities(
 
 def _probability(coefficients: Coefficients, level: CandidateLevel, shift: float = 0.0) -> float:
     design = shipped_prior().design(level.features[None])
-    return float(sigmoid(design @ np.array(coefficients) + shift)[0])
+    return float(sigmoid(design @ extended(coefficients, design.shape[1]) + shift)[0])
+
+
+def extended(coefficients: Coefficients, count: int) -> FloatArray:
+    """Return (count,) coefficients: those that the shipped prior lacks are 0."""
+    return np.pad(np.array(coefficients), (0, count - len(coefficients)))
 
 
 def sigmoid(x: NDArray[np.float64]) -> NDArray[np.float64]:

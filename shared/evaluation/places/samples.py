@@ -8,8 +8,10 @@ map, which flatters the result.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import replace
 from datetime import datetime, timedelta
+from functools import partial
 from statistics import median
 
 import numpy as np
@@ -18,8 +20,10 @@ from numpy.typing import NDArray
 from shared.evaluation.places.evidence import (
     DIFFERENT_PLACE_M,
     EVIDENCE_DEPTH,
+    MATCHED_PHOTOS,
     PhotoLocation,
     RankedPhoto,
+    are_matched,
 )
 from shared.evaluation.places.fit import PlaceSample
 from shared.evaluation.places.levels import (
@@ -45,6 +49,8 @@ IndexRanking = tuple[Indices, NDArray[np.float64]]
 """(k,) numbers of photos, best first, and their scores"""
 RankOwnPhoto = Callable[[int], IndexRanking | None]
 """Ranks the photos of the map by their similarity to one of them, without it."""
+MatchOwnPhoto = Callable[[int, Sequence[Hashable]], Sequence[float | None]]
+"""Returns the `match_support` of a photo with each of others; None where they can't be compared."""
 
 
 class OwnPhotoSampler:
@@ -95,11 +101,14 @@ class OwnPhotoSampler:
         ]
         return median([ranking_spread(ranking) for ranking in rankings] or [1.0])
 
-    def samples(self, photos: Sequence[int], spread: float) -> Iterator[PlaceSample]:
+    def samples(
+        self, photos: Sequence[int], spread: float, match: MatchOwnPhoto | None = None
+    ) -> Iterator[PlaceSample]:
         """Yield the samples of photos: each as it is, and as an impostor of each kind.
 
         The last kind stands for queries from far away, for which every level is wrong: they find
-        what an impostor finds.
+        what an impostor finds. With `match`, the samples have the features of matches; those whose
+        first photos can't all be compared are left out.
         """
         for photo in photos:
             visible = self._visible(photo)
@@ -107,7 +116,7 @@ class OwnPhotoSampler:
             levels: list[CandidateLevel] = []
             left_out = None
             for left_out, missing in self._kinds(photo):
-                levels = self._levels(photo, visible & ~missing, spread)
+                levels = self._levels(photo, visible & ~missing, spread, match)
                 if levels:
                     right = [level.is_right(self._locations[photo]) for level in levels]
                     yield PlaceSample(photo, levels, right, left_out, is_alone)
@@ -122,14 +131,23 @@ class OwnPhotoSampler:
         return self._ranked(ranking, self._known if visible is None else visible)
 
     def _levels(
-        self, photo: int, visible: NDArray[np.bool_], spread: float
+        self,
+        photo: int,
+        visible: NDArray[np.bool_],
+        spread: float,
+        match: MatchOwnPhoto | None,
     ) -> list[CandidateLevel]:
-        ranking = self.ranking(photo)
-        if ranking is None:
+        found = self.ranking(photo)
+        if found is None:
             return []
-        first = ranking[0][visible[ranking[0]]][:1]
+        ranking = self._ranked(found, visible)
+        if match is not None:
+            ranking = attach_matches(ranking, partial(match, photo))
+            if not are_matched(ranking):
+                return []
+        first = found[0][visible[found[0]]][:1]
         return candidate_levels(
-            self._ranked(ranking, visible),
+            ranking,
             self.neighbours(int(first[0]), visible) if len(first) else [],
             self._scheme,
             spread,
@@ -180,6 +198,15 @@ class OwnPhotoSampler:
             return np.full(len(self._locations), np.inf)
         away = distances_m(spot.latitude, spot.longitude, self._latitudes, self._longitudes)
         return np.where(np.isnan(away), np.inf, away)
+
+
+def attach_matches(
+    ranking: Sequence[RankedPhoto], match: Callable[[Sequence[Hashable]], Sequence[float | None]]
+) -> list[RankedPhoto]:
+    """Return a ranking whose first MATCHED_PHOTOS have their match support."""
+    support = match([r.photo for r in ranking[:MATCHED_PHOTOS]])
+    first = [replace(r, support=s) for r, s in zip(ranking, support, strict=False)]
+    return [*first, *ranking[len(first) :]]
 
 
 def _or_nan(value: float | None) -> float:

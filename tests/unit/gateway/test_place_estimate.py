@@ -84,7 +84,7 @@ def answer(
     located = locate_hits(hits, photos)
     shown = [ranked for ranked in located if (ranked.score, ranked.location) in found]
     estimate = model.estimate(located, [], SCHEME, 0.95, RADIUS_M, shown)
-    return estimate_place(shown, estimate, model, 0.95, RADIUS_M, "no place")
+    return estimate_place(estimate, 0.95, RADIUS_M, "no place")
 
 
 def fitted(limit: float | None) -> PlaceModel:
