@@ -36,7 +36,7 @@ class AsyncClient(AsyncTransport):
     """Client of one server and one map."""
 
     async def upload(
-        self, photo: str | Path | BinaryIO, filename: str | None = None, **fields: Any
+        self, /, photo: str | Path | BinaryIO, filename: str | None = None, **fields: Any
     ) -> answers.Uploaded:
         """Upload a photo, streamed from its file.
 
@@ -57,7 +57,7 @@ class AsyncClient(AsyncTransport):
         return answers.Uploaded(**await self._send_file("/upload", file, filename, data=data))
 
     async def upload_direct(
-        self, photo: str | Path, filename: str | None = None, **fields: Any
+        self, /, photo: str | Path, filename: str | None = None, **fields: Any
     ) -> answers.Uploaded:
         """Upload a photo directly to the server's bucket with a presigned URL.
 
@@ -118,6 +118,7 @@ class AsyncClient(AsyncTransport):
 
     async def similar(
         self,
+        /,
         photo: str | Path | answers.Photo | UUID,
         top_k: int = 10,
         min_score: float | None = None,
@@ -178,7 +179,7 @@ class AsyncClient(AsyncTransport):
         )
 
     async def propose_positions(
-        self, photos: Sequence[Json], track: Sequence[Json] = (), **options: Any
+        self, /, photos: Sequence[Json], track: Sequence[Json] = (), **options: Any
     ) -> list[answers.Proposal]:
         """Propose where photos were taken that have no coordinates. Nothing is stored.
 
@@ -197,7 +198,7 @@ class AsyncClient(AsyncTransport):
         return [answers.Proposal(**each) for each in answer["proposals"]]
 
     async def begin_track(
-        self, *, motion: str | None = None, max_speed_mps: float | None = None, **start: Any
+        self, /, *, motion: str | None = None, max_speed_mps: float | None = None, **start: Any
     ) -> answers.Track:
         """Begin a track: a sequence of frames that is followed through the map.
 
@@ -212,6 +213,7 @@ class AsyncClient(AsyncTransport):
 
     async def add_frame(
         self,
+        /,
         track_id: Id,
         photo: str | Path,
         captured_at: datetime,
@@ -275,7 +277,7 @@ class AsyncClient(AsyncTransport):
         path = f"/jobs/{_job_id(work)}"
         return answers.Job(**await self._call("GET", path, params={"wait": wait_seconds}))
 
-    def jobs(self, **filters: Any) -> AsyncIterator[answers.Job]:
+    def jobs(self, /, **filters: Any) -> AsyncIterator[answers.Job]:
         """Iterate over the map's jobs, newest first; filters are `state` and `kind`."""
         return self._iterate(answers.Job, "/jobs", "jobs", **filters)
 
@@ -351,11 +353,11 @@ class AsyncClient(AsyncTransport):
         """Download the original bytes of a photo."""
         return await self._get_bytes(f"/uploads/{file_id}/image")
 
-    def photos(self, **filters: Any) -> AsyncIterator[answers.Photo]:
+    def photos(self, /, **filters: Any) -> AsyncIterator[answers.Photo]:
         """Iterate over photos by metadata, newest first; for filters see `GET /search`."""
         return self._iterate(answers.Photo, "/search", "images", **filters)
 
-    async def patch_photo(self, file_id: Id, **fields: Any) -> answers.OnePhoto:
+    async def patch_photo(self, /, file_id: Id, **fields: Any) -> answers.OnePhoto:
         """Update a photo's metadata: omitted fields are unchanged, None clears a field."""
         return answers.OnePhoto(**await self._call("PATCH", f"/uploads/{file_id}", json=fields))
 
@@ -363,7 +365,7 @@ class AsyncClient(AsyncTransport):
         """Delete a photo."""
         return answers.Deleted(**await self._call("DELETE", f"/uploads/{file_id}"))
 
-    async def fit_vocabulary(self, **options: int) -> answers.Started:
+    async def fit_vocabulary(self, /, **options: int) -> answers.Started:
         """Start fitting a vocabulary on the map's photos.
 
         Options are `clusters`, `sample` and `seed`.
@@ -423,7 +425,7 @@ class AsyncClient(AsyncTransport):
         path = f"/generations/{generation_id}/descriptors"
         await self._download(path, file, on_received)
 
-    async def learn_word_weights(self, generation_id: Id, **options: int) -> answers.Started:
+    async def learn_word_weights(self, /, generation_id: Id, **options: int) -> answers.Started:
         """Start fitting word weights of the active generation; options are `sample` and `seed`."""
         path = f"/generations/{generation_id}/word-weights"
         return answers.Started(**await self._call("POST", path, json=options))
@@ -433,7 +435,7 @@ class AsyncClient(AsyncTransport):
         path = f"/generations/{generation_id}/word-weights"
         return answers.WordWeights(**await self._call("GET", path))
 
-    async def evaluate(self, **options: int) -> answers.Started:
+    async def evaluate(self, /, **options: int) -> answers.Started:
         """Start an evaluation of the map; options are `sample` and `seed`."""
         return answers.Started(**await self._call("POST", "/evaluations", json=options))
 
@@ -545,7 +547,7 @@ class AsyncClient(AsyncTransport):
         return [answers.Key(**item) for item in await self._call("GET", "/keys")]
 
     async def create_key(
-        self, name: str, scopes: Sequence[str], **limits: Any
+        self, /, name: str, scopes: Sequence[str], **limits: Any
     ) -> answers.CreatedKey:
         """Create an API key (admin only). Its secret is shown only in this response.
 

@@ -75,7 +75,7 @@ def _blocking(
     method: Callable[Concatenate[AsyncClient, P], Awaitable[Answer]],
 ) -> Callable[Concatenate[Client, P], Answer]:
     @functools.wraps(method)
-    def call(client: Client, *args: P.args, **kwargs: P.kwargs) -> Answer:
+    def call(client: Client, /, *args: P.args, **kwargs: P.kwargs) -> Answer:
         return _run(method(client._calls, *args, **kwargs))
 
     return call
@@ -85,7 +85,7 @@ def _iterating(
     method: Callable[Concatenate[AsyncClient, P], AsyncIterator[Answer]],
 ) -> Callable[Concatenate[Client, P], Iterator[Answer]]:
     @functools.wraps(method)
-    def call(client: Client, *args: P.args, **kwargs: P.kwargs) -> Iterator[Answer]:
+    def call(client: Client, /, *args: P.args, **kwargs: P.kwargs) -> Iterator[Answer]:
         return _iterate(method(client._calls, *args, **kwargs))
 
     return call
