@@ -21,7 +21,7 @@ from shared.catalog.maps import Map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
-from shared.storage.chunks import manifest_key
+from shared.storage.chunks import features_key, manifest_key
 from shared.storage.keys import ORIGINALS
 
 ROWS_PER_QUERY = 1000
@@ -33,6 +33,7 @@ class ObjectKind(StrEnum):
     ORIGINAL = "original"
     CHUNK = "chunk"
     MANIFEST = "manifest"
+    FEATURES = "feature file"
     VOCABULARY = "vocabulary"
     WHITENING = "whitening"
     MODEL = "model"
@@ -71,7 +72,7 @@ def list_referenced_objects(session: Session) -> Iterator[ReferencedObject]:
             row.object_key, ObjectKind.ORIGINAL, row.id, row.size_bytes, row.sha256
         )
     chunks = (
-        select(Chunk.id, Chunk.object_key, Chunk.size_bytes, Chunk.sha256)
+        select(Chunk)
         .join(Generation, Generation.id == Chunk.generation_id)
         .join(Map, Map.id == Generation.map_id)
         .where(
@@ -80,9 +81,18 @@ def list_referenced_objects(session: Session) -> Iterator[ReferencedObject]:
             Map.deleted_at.is_(None),
         )
     )
-    for row in session.execute(chunks.execution_options(yield_per=ROWS_PER_QUERY)):
-        yield ReferencedObject(row.object_key, ObjectKind.CHUNK, row.id, row.size_bytes, row.sha256)
-        yield ReferencedObject(manifest_key(row.object_key), ObjectKind.MANIFEST, row.id)
+    for chunk in session.scalars(chunks.execution_options(yield_per=ROWS_PER_QUERY)):
+        key = chunk.object_key
+        yield ReferencedObject(key, ObjectKind.CHUNK, chunk.id, chunk.size_bytes, chunk.sha256)
+        yield ReferencedObject(manifest_key(key), ObjectKind.MANIFEST, chunk.id)
+        if chunk.features_model is not None:
+            yield ReferencedObject(
+                features_key(key),
+                ObjectKind.FEATURES,
+                chunk.id,
+                chunk.features_bytes,
+                chunk.features_sha256,
+            )
     for table, what in (
         (Vocabulary, ObjectKind.VOCABULARY),
         (StoredWhitening, ObjectKind.WHITENING),

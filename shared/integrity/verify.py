@@ -3,7 +3,7 @@
 `verify_store` reads every object that the catalog references and compares it with size and hash in
 the catalog. The service may run meanwhile: a fault only counts if the catalog still references the
 object afterwards. `repair_descriptors` queues the photos of damaged chunks again, which only needs
-their originals.
+their originals, and gives up damaged local features.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class IntegrityFault:
     """The object's key, or the photo's id."""
     detail: str
     chunk_id: UUID | None = None
-    """The chunk that is unusable."""
+    """The chunk that is unusable, or whose feature file is."""
     photo_id: UUID | None = None
     """The photo whose descriptor has to be computed again."""
 
@@ -128,12 +128,16 @@ class _Verifier:
     def __init__(self, catalog: Catalog, store: ObjectStore, *, originals: bool) -> None:
         self._catalog = catalog
         self._store = store
-        self._read_kinds = {ObjectKind.MODEL} | ({ObjectKind.ORIGINAL} if originals else set())
+        self._read_kinds = {ObjectKind.MODEL, ObjectKind.FEATURES}
+        if originals:
+            self._read_kinds.add(ObjectKind.ORIGINAL)
         self.report = IntegrityReport()
 
     def verify(self, one: ReferencedObject) -> IntegrityFault | None:
         """Return the first fault of an object, if any."""
         wrong = None
+        is_of_chunk = one.what in (ObjectKind.CHUNK, ObjectKind.FEATURES)
+        chunk_id = one.row_id if is_of_chunk else None
         try:
             if one.what == ObjectKind.CHUNK:
                 return self._verify_chunk(one)
@@ -151,10 +155,11 @@ class _Verifier:
         except NotFound as error:
             key = str(error.extra["key"])
             what = ObjectKind.MANIFEST if key == manifest_key(one.key) else one.what
-            chunk_id = one.row_id if one.what == ObjectKind.CHUNK else None
             return IntegrityFault(FaultKind.MISSING, what, key, "it is not in the store", chunk_id)
         self.report.checked[one.what] += 1
-        return IntegrityFault(FaultKind.DAMAGED, one.what, one.key, wrong) if wrong else None
+        if wrong is None:
+            return None
+        return IntegrityFault(FaultKind.DAMAGED, one.what, one.key, wrong, chunk_id)
 
     def _verify_chunk(self, one: ReferencedObject) -> IntegrityFault | None:
         """Compare a chunk with its hash, its manifest and the catalog."""
@@ -250,10 +255,17 @@ def repair_descriptors(catalog: Catalog, wakeups: Wakeups, report: IntegrityRepo
     """Queue the photos of damaged chunks and those without a descriptor; return their number.
 
     The rows of the chunks are deleted in the same transaction: until a photo is described again, it
-    is not found, but no wrong result is either.
+    is not found, but no wrong result is either. A chunk with a damaged feature file has none any
+    more: searches do not match its photos.
     """
     queued = 0
-    for chunk_id in dict.fromkeys(f.chunk_id for f in report.faults if f.chunk_id is not None):
+    faults = [fault for fault in report.faults if fault.chunk_id is not None]
+    without_features = [f.chunk_id for f in faults if f.what == ObjectKind.FEATURES]
+    if without_features:
+        none = {"features_model": None, "features_rows": 0, "features_bytes": 0}
+        with catalog.write() as session:
+            session.execute(update(Chunk).where(Chunk.id.in_(without_features)).values(**none))
+    for chunk_id in dict.fromkeys(f.chunk_id for f in faults if f.what != ObjectKind.FEATURES):
         queued += catalog.run(partial(discard_chunk, chunk_id=chunk_id))
     photo_ids = [fault.photo_id for fault in report.faults if fault.photo_id is not None]
     if photo_ids:

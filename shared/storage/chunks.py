@@ -68,6 +68,15 @@ class WrittenChunk:
     features_sha256: str | None = None
 
 
+# Field of `WrittenChunk` -> its name in the manifest's object `features`.
+MANIFEST_FEATURES = {
+    "features_model": "model",
+    "features_rows": "rows",
+    "features_bytes": "size_bytes",
+    "features_sha256": "sha256",
+}
+
+
 def chunk_key(generation_id: UUID, chunk_id: UUID) -> str:
     return f"chunks/{generation_id}/{chunk_id}.npy"
 
@@ -173,10 +182,7 @@ def write_chunk(
             features_sha256=hashlib.sha256(feature_file).hexdigest(),
         )
         manifest["features"] = {
-            "model": features.model,
-            "rows": written.features_rows,
-            "size_bytes": written.features_bytes,
-            "sha256": written.features_sha256,
+            name: getattr(written, field) for field, name in MANIFEST_FEATURES.items()
         }
         store.put(features_key(key), feature_file)
     store.put(manifest_key(key), json.dumps(manifest).encode())
@@ -196,17 +202,22 @@ class ChunkManifest:
     generation_id: UUID
     sha256: str
     photo_ids: list[UUID]
+    features: dict[str, Any]
+    """the fields `features_*` of `WrittenChunk`; empty without a feature file"""
 
 
 def read_manifest(store: ObjectStore, object_key: str) -> ChunkManifest | None:
     """Return the manifest of a chunk; None if it can't be read, NotFound if it is missing."""
     try:
         content = json.loads(store.get(manifest_key(object_key)))
+        stored = content.get("features") or {}
+        features = {field: stored[name] for field, name in MANIFEST_FEATURES.items() if stored}
         return ChunkManifest(
             UUID(content["chunk_id"]),
             UUID(content["generation_id"]),
             str(content["sha256"]),
             [UUID(photo_id) for photo_id in content["photo_ids"]],
+            features,
         )
     except (ValueError, KeyError, TypeError, AttributeError):
         return None

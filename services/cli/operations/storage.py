@@ -63,6 +63,8 @@ MAX_FAULTS_SHOWN = 20
 REMEDIES = {
     "chunk": "placewise storage verify --repair queues their photos again",
     "manifest": "placewise storage verify --repair queues the photos of their chunks again",
+    "feature file": "placewise storage verify --repair stops matching their photos, and placewise "
+    "maps update NAME --matching on computes their local features again",
     "photo": "placewise storage verify --repair queues them again",
     "original": "restore the object from a backup, or delete the photo and upload it again",
     "vocabulary": "restore the object from a backup, or fit a new vocabulary",
@@ -77,7 +79,12 @@ def verify(
         bool, typer.Option("--originals", help="Also check every original photo against its hash.")
     ] = False,
     repair: Annotated[
-        bool, typer.Option("--repair", help="Queue the photos of damaged chunks for description.")
+        bool,
+        typer.Option(
+            "--repair",
+            help="Queue the photos of damaged chunks for description, and give up damaged local "
+            "features.",
+        ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -147,7 +154,7 @@ def _print_report(report: IntegrityReport, queued: int | None) -> None:
         print_message(
             f"and {len(report.faults) - MAX_FAULTS_SHOWN} more. --json lists all of them."
         )
-    repaired = {"chunk", "manifest", "photo"} if queued is not None else set()
+    repaired = {"chunk", "manifest", "feature file", "photo"} if queued is not None else set()
     for kind in dict.fromkeys(fault.what for fault in report.faults):
         if kind not in repaired:
             print_note(f"{plural(kind)}: {REMEDIES[kind]}")

@@ -25,7 +25,13 @@ from shared.errors import NotFound, PlacewiseError, Unavailable
 from shared.ingest.store_photo import insert_photo
 from shared.ingest.validation import StoredUpload, ValidatedPhoto, validate_photo
 from shared.storage import ObjectStore
-from shared.storage.chunks import ChunkManifest, decode_rows, read_manifest, rows_are_valid
+from shared.storage.chunks import (
+    ChunkManifest,
+    decode_rows,
+    features_key,
+    read_manifest,
+    rows_are_valid,
+)
 from shared.storage.keys import ORIGINALS
 
 CHUNKS = "chunks/"
@@ -84,6 +90,8 @@ def _recover_chunk(
     if rows is None or len(rows) != len(manifest.photo_ids) or not rows_are_valid(rows).all():
         recovered.damaged_chunks.append(key)
         return
+    file = store.head(features_key(key)) if manifest.features else None
+    has_features = file is not None and file.size_bytes == manifest.features["features_bytes"]
     with catalog.write() as session:
         generation = session.get_one(Generation, manifest.generation_id)
         session.add(
@@ -95,6 +103,7 @@ def _recover_chunk(
                 rows=len(rows),
                 size_bytes=len(data),
                 sha256=manifest.sha256,
+                **(manifest.features if has_features else {}),
             )
         )
         session.flush()

@@ -127,6 +127,32 @@ def test_choosing_a_vocabulary_switches_automatic_fits_off(service: Service) -> 
     assert average["next_fit_photos"] is None, "its extractor uses no vocabulary"
 
 
+def test_matching_on_starts_a_model_change_where_photos_have_no_local_features(
+    service: Service,
+) -> None:
+    service.json("POST", "/maps", 201, json={"name": "quay", "matching": "off"})
+    made = service.json("PATCH", "/maps/quay", json={"matching": "on"})
+    assert (made["matching"], made["local_features"], made["model_change_id"]) == ("on", None, None)
+    service.json("PATCH", "/maps/quay", json={"matching": "off"})
+    service.indexed(1, 2, map_name="quay")
+    before = service.json("GET", "/maps/quay")
+    features = {"model": None, "photos": 0, "missing": 2, "bytes": 0, "used": None}
+    assert (before["local_features"], before["model_change_id"]) == (features, None)
+    changed = service.json("PATCH", "/maps/quay", json={"matching": "on"})
+    assert changed["model_change_id"] is not None
+    again = service("PATCH", "/maps/quay", json={"matching": "on"})
+    problem(again, 409, "model_change_running")
+    finish_changes(service)
+    after = service.json("GET", "/maps/quay")
+    assert after["generation_id"] != before["generation_id"]
+    assert after["local_features"]["photos"] == 2
+    assert after["local_features"]["missing"] == 0
+    assert after["local_features"]["bytes"] > 0
+    assert service.json("PATCH", "/maps/quay", json={"matching": "on"})["model_change_id"] is None
+    response = service("PATCH", "/maps/quay", json={"matching": "sometimes"})
+    problem(response, 422, "invalid_field")
+
+
 # --- what people see -------------------------------------------------------------------------
 
 

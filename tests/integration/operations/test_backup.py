@@ -159,6 +159,9 @@ def test_a_backup_goes_from_either_database_into_the_other_and_answers_the_same(
         assert name == "jobs" or rows_of(other_catalog, name) == live, name
     other = Service(other_catalog, other_store, settings, make_worker)
     assert answers(other, known) == answers(service, known)
+    features = [each.json("GET", "/maps/default")["local_features"] for each in (service, other)]
+    assert features[0] == features[1]
+    assert features[1]["photos"] == 4
     states = {
         row["id"]: (row["state"], row["lease_token"]) for row in rows_of(other_catalog, "jobs")
     }

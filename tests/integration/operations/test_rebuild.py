@@ -116,6 +116,9 @@ def test_every_photo_is_searchable_again_with_its_metadata(
     settings: Settings,
 ) -> None:
     left = two_maps(service)
+    service.json("PATCH", "/maps/halls", json={"matching": "on"})
+    matched = [(m["matching"], m["local_features"]) for m in service.json("GET", "/maps")]
+    assert [features["photos"] for _, features in matched] == [4, 3]
     service.json("POST", "/maps", 201, json={"name": "gone"})
     service.indexed(9, map_name="gone")
     service.json("DELETE", "/maps/gone")
@@ -141,7 +144,9 @@ def test_every_photo_is_searchable_again_with_its_metadata(
         assert session.scalar(select(func.count()).select_from(Photo)) == 6
     assert verify_store(service.catalog, store, originals=True).faults == []
     check_not_behind(service.catalog, store)
-    assert [m["name"] for m in service.json("GET", "/maps")] == ["default", "halls"]
+    maps = service.json("GET", "/maps")
+    assert [m["name"] for m in maps] == ["default", "halls"]
+    assert [(m["matching"], m["local_features"]) for m in maps] == matched
     # It goes on: new photos come into the same generations, and the journal too.
     (new,) = service.indexed(7, map_name="halls")
     assert answers(service, new, "halls")

@@ -15,7 +15,7 @@ from shared.catalog.maps import Map, mark_map_deleted
 from shared.catalog.photos import Photo
 from shared.integrity.verify import IntegrityReport, repair_descriptors, verify_store
 from shared.jobs import InProcessWakeups
-from shared.storage.chunks import manifest_key
+from shared.storage.chunks import features_key, manifest_key
 from tests.integration.in_process_api import Service
 from tests.integration.workplace import Workplace
 
@@ -47,7 +47,7 @@ def test_a_whole_store_has_no_faults_and_the_bytes_of_a_deleted_photo_are_not_mi
     first, *_ = service.indexed(1, 2, 3)
     report = looked(service, originals=True)
     assert report.faults == []
-    assert report.checked == {"chunk": 1, "manifest": 1, "original": 3}
+    assert report.checked == {"chunk": 1, "manifest": 1, "feature file": 1, "original": 3}
     assert report.read_bytes > 0
     with service.catalog.read() as session:
         key = session.get_one(Photo, UUID(first)).object_key
@@ -86,6 +86,28 @@ def test_photos_of_a_damaged_chunk_are_described_again(service: Service, damage:
     for one, other in zip(before, after, strict=True):
         assert one["image_id"] == other["image_id"]
         assert one["similarity_score"] == pytest.approx(other["similarity_score"], abs=1e-5)
+
+
+@pytest.mark.parametrize("damage", ["changed", "missing"])
+def test_damaged_local_features_are_given_up_and_photos_are_found_all_the_same(
+    service: Service, damage: str
+) -> None:
+    first, *_ = service.indexed(1, 2, 3)
+    before = service.json("POST", f"/similarity/{first}")["similar_images"]
+    (chunk,) = chunk_keys(service)
+    key = features_key(chunk)
+    if damage == "changed":
+        service.store.put(key, service.store.get(key)[:-1] + b"x")
+    else:
+        service.store.delete(key)
+    report = looked(service)
+    assert faults(report) == {("damaged" if damage == "changed" else "missing", "feature file")}
+    assert mend(service, report) == 0, "no photo is described again"
+    assert looked(service).faults == []
+    assert chunk_keys(service) == [chunk]
+    assert service.json("POST", f"/similarity/{first}")["similar_images"] == before
+    features = service.json("GET", "/maps/default")["local_features"]
+    assert (features["photos"], features["missing"], features["bytes"]) == (0, 3, 0)
 
 
 def test_rows_that_belong_to_other_photos_are_found(service: Service) -> None:

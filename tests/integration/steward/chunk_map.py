@@ -14,6 +14,8 @@ from shared.catalog.chunks import Descriptor, count_searchable, list_live_chunks
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import Map
 from shared.storage import FolderStore
+from shared.storage.chunks import features_key
+from shared.storage.feature_files import FeatureRows, read_feature_file
 from shared.storage.keys import TRASH
 from shared.storage.read_retries import ReadRetries
 from tests.integration.workplace import same
@@ -30,6 +32,10 @@ from tests.support.catalog_rows import (
 HOUR_SECONDS = 3600.0
 DAY_SECONDS = 86_400.0
 MANY = 100  # chunks that an open slot may have before it is worth merging
+
+
+Features = tuple[str, list[bytes]] | None
+"""Model and rows of a feature file; None without."""
 
 
 class ChunkMap:
@@ -51,6 +57,25 @@ class ChunkMap:
         for photo_ids in made:
             add_chunk(self.catalog, self.store, self.generation_id, photo_ids, slot_rows)
         return made
+
+    def chunks_with_features(self, *features: Features) -> list[list[UUID]]:
+        """Publish a chunk of two photos for each of the features; the photos of each."""
+        made = [self.photos(2) for _ in features]
+        for photo_ids, rows in zip(made, features, strict=True):
+            stored = rows and FeatureRows(*rows)
+            add_chunk(self.catalog, self.store, self.generation_id, photo_ids, features=stored)
+        return made
+
+    def features(self) -> Features:
+        """The model and the rows of the feature file of the only live chunk."""
+        with self.catalog.read() as session:
+            (chunk,) = list_live_chunks(session, self.generation_id)
+        if chunk.features_model is None:
+            return None
+        key = features_key(chunk.object_key)
+        stored = read_feature_file(self.store, key, chunk.features_sha256)
+        assert sum(map(bool, stored.rows)) == chunk.features_rows
+        return stored.model, [bytes(row) for row in stored.rows]
 
     def delete(self, *photo_ids: UUID) -> None:
         for photo_id in photo_ids:

@@ -17,9 +17,9 @@ from shared.catalog.chunks import Descriptor, count_searchable, list_live_chunks
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.photos import Photo
-from shared.storage.chunks import WrittenChunk, read_chunk, write_chunk
+from shared.storage.chunks import WrittenChunk, features_key, read_chunk, write_chunk
 from shared.storage.read_retries import ReadRetries
-from tests.integration.steward.chunk_map import HOUR_SECONDS, ChunkMap
+from tests.integration.steward.chunk_map import HOUR_SECONDS, ChunkMap, Features
 from tests.integration.workplace import same
 from tests.support.catalog_rows import row_of, stored_rows
 
@@ -94,6 +94,45 @@ def test_rows_of_deleted_photos_are_dropped(chunk_map: ChunkMap) -> None:
     assert chunk_map.merge() == 1
     assert chunk_map.live() == [(0, 7)]
     chunk_map.check_rows([*first[1:4], *second[:2], *second[3:]])
+
+
+FEATURES = ("xfeat@1", [b"one", b"two"])
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "merged"),
+    [
+        (FEATURES, ("xfeat@1", [b"", b"four"]), ("xfeat@1", [b"two", b"", b"four"])),
+        (FEATURES, None, ("xfeat@1", [b"two", b"", b""])),
+        (None, FEATURES, ("xfeat@1", [b"", b"one", b"two"])),
+        (FEATURES, ("aliked-n16@1", [b"", b"four"]), ("aliked-n16@1", [b"", b"", b"four"])),
+        (None, None, None),
+    ],
+)
+def test_local_features_are_merged_row_by_row_by_the_newest_model(
+    chunk_map: ChunkMap, first: Features, second: Features, merged: Features
+) -> None:
+    photo_ids = sum_of(chunk_map.chunks_with_features(first, second))
+    chunk_map.delete(photo_ids[0])
+    assert chunk_map.merge_slot()
+    assert chunk_map.features() == merged
+    chunk_map.check_rows(photo_ids[1:])
+
+
+@pytest.mark.parametrize("damage", ["changed", "missing"])
+def test_damaged_local_features_are_dropped_and_the_rows_are_merged(
+    chunk_map: ChunkMap, damage: str
+) -> None:
+    photo_ids = sum_of(chunk_map.chunks_with_features(FEATURES, ("xfeat@1", [b"3", b"4"])))
+    with chunk_map.catalog.read() as session:
+        key = features_key(list_live_chunks(session, chunk_map.generation_id)[0].object_key)
+    if damage == "changed":
+        chunk_map.store.put(key, chunk_map.store.get(key)[:-1] + b"x")
+    else:
+        chunk_map.store.delete(key)
+    assert chunk_map.merge_slot()
+    assert chunk_map.features() == ("xfeat@1", [b"", b"", b"3", b"4"])
+    chunk_map.check_rows(photo_ids)
 
 
 def test_a_slot_of_deleted_photos_is_left_without_a_chunk(chunk_map: ChunkMap) -> None:
