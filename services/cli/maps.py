@@ -144,7 +144,7 @@ def update(
     with connect(server, name, key) as client, progress_bar() as progress:
         updated = client.update_map(name, auto_fit=auto_fit, matching=matching)
         if matching == "on" and updated.model_change_id:
-            wait_for_job(client, client.job(updated.model_change_id), progress, "local features")
+            wait_for_job(client, updated.model_change_id, progress, "local features")
             updated = next(map_ for map_ in client.maps() if map_.name == name)
     changes = [_describe_auto_fit(updated)] if auto_fit is not None else []
     changes += [f"matching {_format_features(updated)}"] if matching else []

@@ -10,20 +10,47 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from services.cli.maps import app
-from shared.errors import Misconfigured
-from tests.support.api_responses import MAP
+from shared.errors import InvalidRequest, Misconfigured
+from tests.support.api_responses import JOB, MAP
 from tests.support.fake_server import FakeServer, running_server
 
 
 def test_create_sends_the_options_that_are_given(server: FakeServer) -> None:
     server.will_answer(201, MAP)
-    options = ["--place-labels-are-paths", "--rows", "float16", "--server", server.url]
-    result = CliRunner().invoke(app, ["create", "tower", *options])
+    options = ["--place-labels-are-paths", "--rows", "float16", "--matching", "off"]
+    result = CliRunner().invoke(app, ["create", "tower", *options, "--server", server.url])
     assert result.exit_code == 0, result.output
     _, path, body = server.requests[0]
     assert path == "/api/v1/maps"
-    sent = {"name": "tower", "place_labels_are_paths": True, "rows": "float16"}
-    assert json.loads(body) == sent
+    assert json.loads(body) == {
+        "name": "tower",
+        "place_labels_are_paths": True,
+        "rows": "float16",
+        "matching": "off",
+    }
+
+
+def test_matching_on_waits_for_the_local_features_and_says_how_many_there_are(
+    server: FakeServer,
+) -> None:
+    features = {"model": "xfeat@1", "photos": 0, "missing": 3, "bytes": 0, "used": None}
+    on = MAP | {"matching": "on", "local_features": features, "model_change_id": JOB["job_id"]}
+    features = features | {"photos": 3, "missing": 0, "bytes": 210_000, "used": True}
+    done = on | {"local_features": features, "model_change_id": None}
+    for answer in (on, JOB, [done]):
+        server.will_answer(200, answer)
+    options = ["update", "tower", "--matching", "on", "--server", server.url]
+    result = CliRunner().invoke(app, options)
+    assert result.exit_code == 0, result.output
+    assert json.loads(server.requests[0][2]) == {"matching": "on"}
+    assert server.requests[1][1].startswith(f"/api/v1/jobs/{JOB['job_id']}")
+    assert "Map tower: matching on: 3 photos, 0.2 MB, used." in result.output
+
+
+def test_update_without_a_change_is_refused() -> None:
+    result = CliRunner().invoke(app, ["update", "tower"])
+    assert isinstance(result.exception, InvalidRequest)
+    assert result.exception.code == "no_option"
 
 
 def test_with_the_settings_of_separate_services_no_server_is_started(
