@@ -86,24 +86,11 @@ class Deleted(Answer):
     deleted_file_id: UUID
 
 
-class ClusterShare(Answer):
-    """Contribution of a vocabulary cluster to a similarity score."""
+class PointPair(Answer):
+    """Points of the query and of a photo that show the same spot, in pixels of the originals."""
 
-    cluster: int
-    share: float
-
-
-class Explanation(Answer):
-    """Decomposition of a similarity score into shares that add up to it.
-
-    `overlay` is an image as a data URI.
-    """
-
-    clusters: list[ClusterShare] | None
-    rows: int
-    columns: int
-    overlay: str
-    full_share: float
+    query: tuple[float, float]
+    photo: tuple[float, float]
 
 
 class SimilarPhoto(Photo):
@@ -111,9 +98,22 @@ class SimilarPhoto(Photo):
 
     similarity_score: float
     weighted_score: float | None = None
-    rerank_score: float | None = None
     match_probability: float | None = None
-    explanation: Explanation | None = None
+    inliers: int | None = None
+    """Number of points that match the query's; None if the photo was not matched."""
+    pairs: list[PointPair] | None = None
+    """These points, with `explain`."""
+
+
+class Matches(Answer):
+    """How the local features of the query were matched with those of the best photos."""
+
+    compared: int
+    missing: int
+    reason: str | None = None
+    query_width: int | None = None
+    """Of the upright query in pixels."""
+    query_height: int | None = None
 
 
 class EstimateLevel(Answer):
@@ -158,6 +158,8 @@ class Similar(Answer):
     similar_images: list[SimilarPhoto]
     matches_without_place: int = 0
     estimate: Estimate
+    matches: Matches | None = None
+    """None if no photo was to be matched."""
     vocabulary: str
     word_weights: str
     generation_id: UUID

@@ -122,6 +122,7 @@ class AsyncClient(AsyncTransport):
         photo: str | Path | answers.Photo | UUID,
         top_k: int = 10,
         min_score: float | None = None,
+        matches: int | None = None,
         rerank: int | None = None,
         explain: bool = False,
         wait_seconds: int = 60,
@@ -133,8 +134,10 @@ class AsyncClient(AsyncTransport):
             photo: A file, which is not stored, or a stored photo (a Photo or its UUID).
             top_k: Maximum number of results.
             min_score: Minimum cosine similarity.
-            rerank: Number of first results to rerank by comparing patches.
-            explain: Add explanations to the results.
+            matches: Number of first results whose local features are matched with the photo's, 0 to
+                50; each of them has `inliers`. By default, the map decides.
+            rerank: Number of first results to match and to order by their inliers.
+            explain: Add the matching points (`pairs`) to the results that are matched.
             wait_seconds: How long the server may hold the call (`Prefer: wait`) before the client
                 polls the job instead.
             filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
@@ -148,6 +151,7 @@ class AsyncClient(AsyncTransport):
             "params": drop_none(
                 top_k=top_k,
                 min_score=min_score,
+                matches=matches,
                 rerank=rerank,
                 explain=explain or None,
                 **filters,
@@ -159,7 +163,7 @@ class AsyncClient(AsyncTransport):
             answer = await self._call("POST", f"/similarity/{file_id}", **options)
         else:
             answer = await self._send_file("/similarity", Path(photo), **options)
-        while "result_url" in answer:  # one job may lead to another
+        if "result_url" in answer:
             async for _ in self.watch(answer["job_id"]):
                 pass
             answer = await self._call("GET", answer["result_url"].removeprefix(API))

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.progress_bar import ProgressBar
 from rich.table import Column
 
-from placewise.answers import Estimate, EstimateLevel, Explanation
+from placewise.answers import Estimate, EstimateLevel, Matches
 from services.cli.client import connect, describe_target
 from services.cli.output import (
     JsonOption,
@@ -23,9 +23,8 @@ from services.cli.output import (
     print_message,
     print_table,
 )
-from shared.search_api.comparison import MAX_RERANK_CANDIDATES
+from shared.search_api.protocol import MAX_MATCHED_PHOTOS
 
-MAX_CLUSTERS_SHOWN = 3  # per explanation
 BAR_WIDTH = 20  # characters
 CALIBRATION_SOURCES = {
     "prior": "on generated maps; this map has few photos",
@@ -63,21 +62,24 @@ def query(
             help="Rank by the map's word weights, if it has any.",
         ),
     ] = True,
+    matches: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=MAX_MATCHED_PHOTOS,
+            help="Match the local features of the first N results. Default: as the map decides.",
+            metavar="N",
+        ),
+    ] = None,
     rerank: Annotated[
         int | None,
         typer.Option(
             min=1,
-            max=MAX_RERANK_CANDIDATES,
-            help="Rerank the first N results by comparing patches.",
+            max=MAX_MATCHED_PHOTOS,
+            help="Match the first N results, and order them by their matching points.",
             metavar="N",
         ),
     ] = None,
-    explain: Annotated[
-        bool,
-        typer.Option(
-            help="Show which image parts make each result similar. --json includes the overlays."
-        ),
-    ] = False,
     certainty: Annotated[
         float | None,
         typer.Option(
@@ -97,8 +99,8 @@ def query(
             photo,
             top_k=top_k,
             min_score=min_score,
+            matches=matches,
             rerank=rerank,
-            explain=explain,
             near=near,
             box=box,
             captured_after=captured_after,
@@ -120,12 +122,11 @@ def query(
         Column("score", no_wrap=True),
         *([Column("match", justify="right", no_wrap=True)] if levels else []),
         *([Column("weighted", no_wrap=True)] if weighted else []),
-        *([Column("reranked", no_wrap=True)] if rerank else []),
+        *([Column("points", justify="right", no_wrap=True)] if answer.matches else []),
         Column("photo", overflow="fold"),
         Column("latitude", no_wrap=True),
         Column("longitude", no_wrap=True),
         "place",
-        *([Column("explained by", overflow="fold")] if explain else []),
     )
     for rank, match in enumerate(answer.similar_images, start=1):
         table.add_row(
@@ -133,12 +134,11 @@ def query(
             f"{match.similarity_score:.4f}",
             *([format_percent(match.match_probability)] if levels else []),
             *([_format_score(match.weighted_score)] if weighted else []),
-            *([_format_score(match.rerank_score)] if rerank else []),
+            *([_format_count(match.inliers)] if answer.matches else []),
             escape(match.relative_path or match.original_filename),
             _format_degrees(match.latitude),
             _format_degrees(match.longitude),
             escape(match.place or ""),
-            *([_format_explanation(match.explanation)] if explain else []),
         )
     print_table(table)
     if levels:
@@ -146,6 +146,8 @@ def query(
         print_table(_levels_table(answer.estimate))
     else:
         print_message(_format_estimate(answer.estimate))
+    if answer.matches:
+        print_message(_format_matches(answer.matches))
     print_message(
         f"{answer.rows_scanned} photos compared (certificate: {answer.certificate}), "
         f"vocabulary: {answer.vocabulary}, word weights: {answer.word_weights}\n"
@@ -157,14 +159,16 @@ def _format_score(value: float | None) -> str:
     return "" if value is None else f"{value:.4f}"
 
 
-def _format_explanation(explanation: Explanation | None) -> str:
-    """The clusters that contribute most to the score; without a vocabulary, the patch grid."""
-    if explanation is None:
-        return ""
-    if explanation.clusters is None:
-        return f"{explanation.rows} x {explanation.columns} patches"
-    top = explanation.clusters[:MAX_CLUSTERS_SHOWN]
-    return ", ".join(f"cluster {item.cluster}: {item.share:+.4f}" for item in top)
+def _format_count(value: int | None) -> str:
+    return "" if value is None else str(value)
+
+
+def _format_matches(matches: Matches) -> str:
+    """How many photos were matched, or why none was."""
+    if matches.reason is not None:
+        return f"No matching points: {matches.reason}"
+    missing = f"; {matches.missing} have no local features" if matches.missing else ""
+    return f"{matches.compared} photos were matched{missing}."
 
 
 def _summarize_levels(estimate: Estimate) -> str:

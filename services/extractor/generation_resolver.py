@@ -27,7 +27,7 @@ from services.extractor.model_registry import (
 from shared.catalog.database.base import db_now
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, active_generation
-from shared.catalog.jobs import QUERY_JOBS, WaitingFor
+from shared.catalog.jobs import WaitingFor
 from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.vocabularies import VocabularyOrigin, add_vocabulary
 from shared.descriptors.extractor import Extractor, spec_fingerprint
@@ -77,7 +77,7 @@ def resolve_generation(context: ExtractorContext, job: Job) -> ResolvedGeneratio
         pipeline.extractor, pipeline.centres, pipeline.projection, generation=generation
     )
     # A query's descriptor is not stored: another decoder release is close enough.
-    check_spec_matches(generation, target, decoder_matters=job.kind not in QUERY_JOBS)
+    check_spec_matches(generation, target, decoder_matters=job.kind != JobKind.DESCRIBE)
     return target
 
 

@@ -29,7 +29,6 @@ from typing import Any
 
 from prometheus_client import CollectorRegistry
 
-import services.extractor.comparison
 import services.extractor.describe
 import services.extractor.model_changes  # noqa: F401  (they register their handlers)
 from services.extractor.added_models import AddedModelLoader

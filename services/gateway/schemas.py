@@ -16,12 +16,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from services.gateway.dependencies import API_PREFIX
 from shared.catalog.generations import GenerationState, RowType
-from shared.catalog.jobs import QUERY_JOBS
 from shared.catalog.maps import DEFAULT_MAP
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.vocabularies import VocabularyOrigin
 from shared.jobs import Job, JobKind, JobState
-from shared.search_api.comparison import SimilarityExplanation
+from shared.search_api.protocol import PointPair
 
 
 class RequestModel(BaseModel):
@@ -103,19 +102,34 @@ class SimilarPhotoResponse(PhotoResponse):
         description="cosine similarity with word weights, if the result is ranked by it; null if "
         "it is ranked by `similarity_score`",
     )
-    rerank_score: float | None = Field(
-        None,
-        description="with `rerank`: the similarity plus half of the share (0 to 1) of patches that "
-        "match the query's with a consistent displacement; null if the photo was not compared",
-    )
     match_probability: float | None = Field(
         None,
         description="probability that the photo shows the query's place, at the finest of the "
         "estimate's `levels`; null without levels, and for photos without a place",
     )
-    explanation: SimilarityExplanation | None = Field(
-        None, description="with `explain=true`: contributions of clusters and patches"
+    inliers: int | None = Field(
+        None,
+        description="number of points that match the query's and agree with one camera motion; "
+        "null if the photo was not matched, or has no local features",
     )
+    pairs: list[PointPair] | None = Field(
+        None,
+        description="with `explain=true`: the matching points, most similar first, in pixels of "
+        "the upright originals",
+    )
+
+
+class MatchesResponse(ResponseModel):
+    """How the local features of the query were matched with those of the best photos."""
+
+    compared: int = Field(description="number of photos that were matched")
+    missing: int = Field(
+        description="number of photos that should have been, but have no local features (yet), "
+        "unreadable ones, or those of another model than the query's"
+    )
+    reason: str | None = Field(description="why no photo was matched; null if some were")
+    query_width: int | None = Field(description="of the upright query in pixels, to draw `pairs`")
+    query_height: int | None
 
 
 class EstimateLevelResponse(ResponseModel):
@@ -193,6 +207,7 @@ class SimilarityResponse(ResponseModel):
         "estimate is that of the photos that have",
     )
     estimate: EstimateResponse
+    matches: MatchesResponse | None = Field(None, description="null if no photo was to be matched")
     vocabulary: str = Field(
         description="`own`: fitted on this map's photos; `provisional`: fitted on fewer than 50 of "
         "them; `foreign`: fitted on other photos; `pending`: descriptors are GeM-pooled until the "
@@ -261,7 +276,6 @@ JOB_LABELS = {
     JobKind.INDEX: "Photo",
     JobKind.REINDEX: "Photo for a new model",
     JobKind.DESCRIBE: "Query photo",
-    JobKind.COMPARE: "Comparison",
     JobKind.FIT: "Improving the map",
     JobKind.IMPORT: "Vocabulary import",
     JobKind.SWITCH: "Switch",
@@ -305,7 +319,7 @@ class JobResponse(ResponseModel):
 
     @classmethod
     def of(cls, job: Job, map_name: str) -> JobResponse:
-        is_query = job.kind in QUERY_JOBS
+        is_query = job.kind == JobKind.DESCRIBE
         return cls.of_row(
             job,
             label=JOB_LABELS[JobKind(job.kind)],
@@ -332,7 +346,7 @@ class JobAcceptedResponse(ResponseModel):
     @classmethod
     def of(cls, job: Job, map_name: str, **values: Any) -> Self:
         """Build the response; `values` are the fields that subclasses add."""
-        result_url = job_url(job.id, map_name, "/result") if job.kind in QUERY_JOBS else None
+        result_url = job_url(job.id, map_name, "/result") if job.kind == JobKind.DESCRIBE else None
         return cls(
             job_id=job.id,
             status=JobState(job.state),

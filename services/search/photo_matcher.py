@@ -58,20 +58,23 @@ class PhotoMatcher:
 
     def match(self, request: MatchRequest) -> MatchResponse:
         """See `SearchBackend.match`; Unavailable while the object store can't be read."""
+        none = (None,) * len(request.candidates)
         query = self._read(request.query)
         if query is None:
             reason = "The query has no local features that can be read."
-        elif len(query[1].positions):
+            return MatchResponse(candidates=none, reason=reason)
+        size = (query[1].width, query[1].height)
+        if len(query[1].positions):
             found = _match_threads().map(
                 lambda candidate: self._match_pair(query, candidate, request.with_pairs),
                 request.candidates,
             )
-            return MatchResponse(candidates=tuple(found))
-        elif max(query[1].width, query[1].height) < MIN_SIDE:
+            return MatchResponse(candidates=tuple(found), query_size=size)
+        if max(size) < MIN_SIDE:
             reason = f"The longer side of the query is shorter than {MIN_SIDE} pixels."
         else:
             reason = "The query has too little texture to find points in it."
-        return MatchResponse(candidates=(None,) * len(request.candidates), reason=reason)
+        return MatchResponse(candidates=none, reason=reason, query_size=size)
 
     def _match_pair(
         self, query: ModelFeatures, candidate: FeatureReference, with_pairs: bool

@@ -159,6 +159,22 @@ def count_features(session: Session, generation_id: UUID, detector: str) -> Feat
     return FeatureCounts(*map(int, session.execute(sa.select(*sums).where(live)).one()))
 
 
+def find_feature_rows(
+    session: Session, generation_id: UUID, photo_ids: Sequence[UUID]
+) -> dict[UUID, tuple[str, int]]:
+    """Return object key and row of the chunk of each of the photos, if the chunk has features."""
+    located = session.execute(
+        sa.select(Descriptor.photo_id, Chunk.object_key, Descriptor.row)
+        .join(Chunk, Chunk.id == Descriptor.chunk_id)
+        .where(
+            Descriptor.generation_id == generation_id,
+            Descriptor.photo_id.in_(photo_ids),
+            Chunk.features_model.is_not(None),
+        )
+    )
+    return {photo_id: (object_key, row) for photo_id, object_key, row in located}
+
+
 def list_live_chunks(session: Session, generation_id: UUID) -> list[Chunk]:
     """List the chunks of the generation that are not superseded, by slot."""
     return list(

@@ -66,7 +66,6 @@ class JobKind(StrEnum):
     INDEX = "index"  # describe a stored photo into the active generation
     REINDEX = "reindex"  # describe a stored photo into one generation that is being built
     DESCRIBE = "describe"  # describe a query photo that is not stored
-    COMPARE = "compare"  # compare a query with its search results (`shared.search_api.comparison`)
     FIT = "fit"  # fit a vocabulary on the map's photos and switch to it
     IMPORT = "import_vocabulary"  # check a vocabulary file and switch to it
     SWITCH = "switch"  # switch to a vocabulary that the map already has
@@ -80,18 +79,16 @@ class JobKind(StrEnum):
 FIT_JOBS = (JobKind.FIT, JobKind.PCA)
 MODEL_CHANGE_JOBS = (*FIT_JOBS, JobKind.IMPORT, JobKind.SWITCH)
 
-# A client waits for their result.
-QUERY_JOBS = (JobKind.DESCRIBE, JobKind.COMPARE)
-# Retention of their photos and results: long enough for a client that polls, and for the background
-# of a track; short, because nobody has chosen to store these photos.
+# Retention of query photos: long enough for a client that polls, and for the background of a track;
+# short, because nobody has chosen to store these photos.
 QUERY_TTL_SECONDS = 3600.0
 
 # Extractors run the jobs that need photos and a backbone, the steward those that need only search.
 EXTRACTOR_JOBS = (
     JobKind.INDEX,
     JobKind.REINDEX,
+    JobKind.DESCRIBE,
     JobKind.ADD_MODEL,
-    *QUERY_JOBS,
     *MODEL_CHANGE_JOBS,
 )
 STEWARD_JOBS = (JobKind.EVALUATE, JobKind.WORD_WEIGHTS, JobKind.BATCH)
@@ -100,7 +97,7 @@ STEWARD_JOBS = (JobKind.EVALUATE, JobKind.WORD_WEIGHTS, JobKind.BATCH)
 CHECKPOINTED_JOBS = (*MODEL_CHANGE_JOBS, JobKind.BATCH)
 
 # Claimed one at a time: each is as much work as a batch, or changes the input of the next one.
-SINGLE_CLAIM_JOBS = (*MODEL_CHANGE_JOBS, JobKind.ADD_MODEL, JobKind.COMPARE)
+SINGLE_CLAIM_JOBS = (*MODEL_CHANGE_JOBS, JobKind.ADD_MODEL)
 
 
 class Priority(IntEnum):
@@ -188,7 +185,7 @@ class Job(Base):
         # Lists without a kind exclude reindex jobs, of which a model change has very many.
         partial_index("ix_jobs_map_listed", "map_id", "id", only=kind != JobKind.REINDEX),
         partial_index("ix_jobs_finished", "finished_at", only=finished_at.is_not(None)),
-        partial_index("ix_jobs_asked", "created_at", only=kind.in_(QUERY_JOBS)),
+        partial_index("ix_jobs_asked", "created_at", only=kind == JobKind.DESCRIBE),
         Index("ix_jobs_map_state", "map_id", "state", "id"),
         Index("ix_jobs_map_kind", "map_id", "kind", "id"),
         Index("ix_jobs_kind_waiting", "kind", "waiting_for"),

@@ -120,14 +120,6 @@ class GatewaySettings(BaseSettings):
         "tracks are rejected and batches wait; query photos are rejected below a tenth of it",
     )
 
-    # Comparison of query and results (`rerank`, `explain`).
-    compare_wait_seconds: float = Field(
-        10.0,
-        ge=0,
-        description="maximum wait for a comparison inside a request, seconds; after that the "
-        "response is 202 with a job to poll",
-    )
-
     @field_validator("admin_key")
     @classmethod
     def _check_admin_key(cls, value: SecretStr | None) -> SecretStr | None:

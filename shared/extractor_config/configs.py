@@ -104,11 +104,6 @@ class ExtractorConfig:
         return self.aggregator in ("vlad", "soft-vlad")
 
     @property
-    def has_local_features(self) -> bool:
-        """Whether the backbone computes local features, one for each patch of a photo."""
-        return self.aggregator != "none"
-
-    @property
     def dimension(self) -> int | None:
         """Dimension of the descriptor with a vocabulary of `clusters` centres; None as for `width`.
 

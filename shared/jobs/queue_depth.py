@@ -12,7 +12,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from shared.catalog.database.base import db_now_plus
-from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, Job, JobKind, Priority
+from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, Priority
 from shared.catalog.maps import Map
 
 THROUGHPUT_WINDOW_SECONDS = 60.0
@@ -87,7 +87,7 @@ def measure_queue_depth(session: Session, limit: int) -> QueueDepth:
     finished = (
         select(Job.id)
         .where(
-            Job.kind.in_((JobKind.INDEX, *QUERY_JOBS)),
+            Job.kind.in_((JobKind.INDEX, JobKind.DESCRIBE)),
             Job.finished_at > db_now_plus(-THROUGHPUT_WINDOW_SECONDS),
         )
         .limit(MAX_COUNTED_FINISHED)

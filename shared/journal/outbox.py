@@ -18,7 +18,7 @@ from shared.catalog.installation import (
     check_not_behind,
     get_or_create_installation,
 )
-from shared.catalog.jobs import QUERY_JOBS, Job, JobKind, JobState
+from shared.catalog.jobs import Job, JobKind, JobState
 from shared.journal.segments import (
     MIN_SEGMENTS_TO_MERGE,
     SNAPSHOT_TABLES,
@@ -102,7 +102,7 @@ def _select_for_snapshot(name: str) -> Select[Any]:
     of_photo = Job.kind.in_((JobKind.INDEX, JobKind.REINDEX))
     of_running_items = select(BatchItem.photo_job_id).where(BatchItem.state == JobState.RUNNING)
     return select(table).where(
-        Job.kind.not_in(QUERY_JOBS),
+        Job.kind != JobKind.DESCRIBE,
         or_(~of_photo, Job.state != JobState.SUCCEEDED, Job.id.in_(of_running_items)),
     )
 

@@ -183,6 +183,9 @@ class SearchStatus(_Message):
         return {key: value for key, value in self.versions.items() if key not in self.incomplete}
 
 
+MAX_MATCHED_PHOTOS = 50  # of a query
+
+
 class FeatureReference(_Message):
     """Reference to the local features of a photo: row `row` of the feature file `object_key`."""
 
@@ -227,6 +230,8 @@ class MatchResponse(_Message):
 
     candidates: tuple[PhotoMatches | None, ...]
     """by candidate; None where its features are missing, damaged, or of another model"""
+    query_size: tuple[int, int] | None = None
+    """width and height of the upright query in pixels; None if it has no features"""
     reason: str | None = None
     """why the query itself can't be matched; then all candidates are None"""
 

@@ -18,7 +18,6 @@
 | `queries/<job>`, `queries/<job>.npy` | a query photo that is not stored, and its descriptor |
 | `queries/<job>.features` | its local features |
 | `queries/<job>.jpg` | a preview of a query photo in a format that not all browsers show |
-| `queries/<job>.json` | the result of a comparison |
 | `trash/<day>/<key>` | an orphan moved to the trash on that day, deleted after TRASH_DAYS |
 | `imports/...` | the operator's files, which Placewise only reads |
 

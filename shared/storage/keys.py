@@ -132,22 +132,13 @@ def query_preview_key(job_id: UUID) -> str:
     return f"{QUERIES}{job_id}.jpg"
 
 
-def comparison_key(job_id: UUID) -> str:
-    """Return the key of a comparison's result.
-
-    It is the JSON of a `shared.search_api.comparison.CompareResult`.
-    """
-    return f"{QUERIES}{job_id}.json"
-
-
 def query_object_keys(job_id: UUID) -> tuple[str, ...]:
-    """Return the keys of all objects that a query or a comparison may have."""
+    """Return the keys of all objects that a query may have."""
     return (
         query_key(job_id),
         query_vector_key(job_id),
         query_features_key(job_id),
         query_preview_key(job_id),
-        comparison_key(job_id),
     )
 
 

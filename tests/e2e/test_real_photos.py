@@ -51,21 +51,6 @@ def test_real_places_are_found_before_and_after_the_map_has_its_own_vocabulary(
     assert sum(own.values()) <= 25
 
 
-def test_what_makes_real_places_similar_is_explained_and_reranking_keeps_the_easy_ones_first(
-    server: ServerProcess, real_photos: Path
-) -> None:
-    for name in EASY:
-        query = (real_photos / "toy-places" / "queries" / name).read_bytes()
-        answer = server.ask(query, top_k=17, rerank=17, explain="true").json()
-        best = answer["similar_images"][0]
-        assert best["original_filename"] == TRUE_MATCH[name]
-        for found in answer["similar_images"]:
-            shares = [one["share"] for one in found["explanation"]["clusters"]]
-            assert sum(shares) == pytest.approx(found["similarity_score"], abs=1e-4)
-            assert (found["explanation"]["rows"], found["explanation"]["columns"]) == (14, 14)
-            assert found["rerank_score"] >= found["similarity_score"]
-
-
 def ranks(server: ServerProcess, real_photos: Path, vocabulary: str) -> dict[str, int]:
     """The rank (from 1) of each query's true place among all seventeen."""
     found = {}

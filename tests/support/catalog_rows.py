@@ -36,7 +36,6 @@ PRIORITIES = {
     JobKind.INDEX: Priority.UPLOAD,
     JobKind.REINDEX: Priority.REINDEX,
     JobKind.DESCRIBE: Priority.QUERY,
-    JobKind.COMPARE: Priority.QUERY,
     JobKind.EVALUATE: Priority.EVALUATION,
     JobKind.WORD_WEIGHTS: Priority.EVALUATION,
     **dict.fromkeys((*MODEL_CHANGE_JOBS, JobKind.ADD_MODEL), Priority.MODEL_CHANGE),

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Mapping
+from uuid import UUID
 
+import numpy as np
+from sqlalchemy import select
+
+from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.database.session import Catalog
 from shared.ids import new_id
 from shared.matching.features import LocalFeatures
 from shared.search_api.protocol import FeatureReference
 from shared.storage import ObjectStore
+from shared.storage.chunks import features_key
 from shared.storage.feature_files import FeatureRows, encode_feature_file
 
 MODEL = "xfeat@0123456789ab"
@@ -44,3 +51,18 @@ def feature_rows(*photos: LocalFeatures | None, model: str = MODEL) -> FeatureRo
     """Return the rows of a feature file; None is one without features."""
     rows = [b"" if features is None else features.encode() for features in photos]
     return FeatureRows(model, rows)
+
+
+def add_features(
+    catalog: Catalog, store: ObjectStore, photos: Mapping[UUID, LocalFeatures], model: str = MODEL
+) -> None:
+    """Store features of described photos beside their chunks; other photos have none."""
+    with catalog.write() as session:
+        for chunk in session.scalars(select(Chunk)):
+            rows: list[LocalFeatures | None] = [None] * chunk.rows
+            described = select(Descriptor).where(Descriptor.chunk_id == chunk.id)
+            for descriptor in session.scalars(described):
+                rows[descriptor.row] = photos.get(descriptor.photo_id)
+            if any(rows):
+                put_features(store, *rows, model=model, key=features_key(chunk.object_key))
+                chunk.features_model = model

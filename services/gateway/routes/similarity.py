@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from typing import Annotated, Any
 from uuid import UUID
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as PathParameter
-from fastapi.responses import JSONResponse
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.admission import ADMIT_QUERY, AdmissionDep
@@ -19,36 +17,27 @@ from services.gateway.dependencies import (
     GatewayDep,
     JobId,
     MapQuery,
-    load_job_of_map,
     parse_prefer_wait,
     wait_for_job,
 )
 from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
 from services.gateway.schemas import JobAcceptedResponse, SimilarityResponse
 from services.gateway.similarity.execute import find_similar, query_from_job, query_from_photo
-from services.gateway.similarity.rerank import (
-    check_comparison_supported,
-    comparison_response,
-    start_comparison_of_query_photo,
-    start_comparison_of_stored_photo,
-)
-from services.gateway.similarity.search_params import (
-    SearchParams,
-    SimilarityParams,
-)
+from services.gateway.similarity.matches import check_matching_enabled
+from services.gateway.similarity.search_params import SearchParams, SimilarityParams
 from services.gateway.uploads.multipart import FormFile, multipart_schema
 from services.gateway.uploads.query_photo import (
     describe_query_job,
+    query_expired_error,
     query_job_search_params,
     receive_query_photo,
 )
-from shared.catalog.jobs import QUERY_JOBS, QUERY_TTL_SECONDS, UNFINISHED_STATES, get_job
+from shared.catalog.jobs import QUERY_TTL_SECONDS, UNFINISHED_STATES, get_job
 from shared.catalog.maps import get_map
 from shared.errors import Conflict, Gone, NotFound, Unprocessable, invalid_field_error
 from shared.imaging.photo_header import read_photo_header
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.wakeups import WakeupQueue
-from shared.search_api.comparison import query_expired_error
 from shared.storage.keys import query_preview_key
 
 router = APIRouter(tags=["similarity"])
@@ -66,45 +55,16 @@ ERROR_BY_STATUS = {kind.status: kind for kind in (NotFound, Conflict, Gone)}
 @router.post(
     "/similarity/{file_id}",
     operation_id="similar_to_stored",
-    response_model=SimilarityResponse,
-    responses=JOB_PENDING,
     dependencies=[READ],
 )
-async def search_by_stored_photo(
-    request: Request,
-    response: Response,
+def search_by_stored_photo(
     gateway: GatewayDep,
-    idempotent: IdempotentFormDep,
-    admission: AdmissionDep,
     file_id: Annotated[FileId, PathParameter(description="a stored photo")],
     query: Annotated[SimilarityParams, Query()],
-) -> Any:
-    """Find the photos most similar to a stored photo, without that photo.
-
-    With `rerank` or `explain` an extractor compares the photos. If this takes longer than
-    COMPARE_WAIT_SECONDS, or than N seconds with `Prefer: wait=N`, the response is 202 with a job:
-    poll `status_url`, then GET `result_url`.
-    """
+) -> SimilarityResponse:
+    """Find the photos most similar to a stored photo, without that photo."""
     search_params = query.search_params()
-
-    def search() -> SimilarityResponse | Job:
-        if not search_params.needs_comparison:
-            return find_similar(
-                gateway, query_from_photo(gateway, query.map, file_id), search_params
-            )
-        check_comparison_supported(gateway, query.map, search_params)
-        admission.admit_query()
-        idempotent.claim_key(None, QUERY_TTL_SECONDS)
-        return start_comparison_of_stored_photo(
-            gateway, query_from_photo(gateway, query.map, file_id), search_params, idempotent
-        )
-
-    result = await run_in_threadpool(search)
-    if isinstance(result, SimilarityResponse):
-        return result
-    settings = gateway.settings
-    wait = parse_prefer_wait(request) or settings.compare_wait_seconds
-    return await _wait_for_result(gateway, response, result, query.map, wait)
+    return find_similar(gateway, query_from_photo(gateway, query.map, file_id), search_params)
 
 
 @router.post(
@@ -130,8 +90,6 @@ async def search_by_uploaded_photo(
     `Idempotency-Key` gets the 202 of the first one.
     """
     search_params = query.search_params()
-    if search_params.needs_comparison:
-        await run_in_threadpool(check_comparison_supported, gateway, query.map, search_params)
     async with receive_query_photo(request, gateway, admission) as (job_id, file):
         job = await run_in_threadpool(
             _queue_query, gateway, query.map, job_id, file, search_params, idempotent
@@ -139,26 +97,27 @@ async def search_by_uploaded_photo(
     wait = parse_prefer_wait(request)
     if wait:
         response.headers["Preference-Applied"] = f"wait={wait:g}"
-    return await _wait_for_result(gateway, response, job, query.map, wait)
+        described = await wait_for_job(gateway, job.id, wait)
+        if described is None:
+            raise query_expired_error()
+        job = described
+    if job.state in UNFINISHED_STATES:
+        return JobAcceptedResponse.of(job, query.map).to_http(response.headers)
+    return await run_in_threadpool(_result_of, gateway, job)
 
 
 @router.get(
     "/jobs/{job_id}/result",
     operation_id="similarity_result",
-    response_model=SimilarityResponse,
-    responses=JOB_PENDING,
     dependencies=[READ],
 )
-async def read_similarity_result(
-    response: Response, gateway: GatewayDep, job_id: JobId, query: MapQuery
-) -> Any:
-    """Get the result of a succeeded query job; 409 while it is unfinished.
-
-    For an uploaded photo with `rerank` or `explain`, the comparison starts now. If it takes longer
-    than COMPARE_WAIT_SECONDS, the response is 202 with its job.
-    """
-    job = await run_in_threadpool(load_job_of_map, gateway, query.map, job_id)
-    if job.kind not in QUERY_JOBS:
+def read_similarity_result(
+    gateway: GatewayDep, job_id: JobId, query: MapQuery
+) -> SimilarityResponse:
+    """Get the result of a succeeded query job; 409 while it is unfinished."""
+    with gateway.catalog.read() as session:
+        job = get_job(session, get_map(session, query.map).id, job_id)
+    if job.kind != JobKind.DESCRIBE:
         raise Conflict("no_result", f"The job {job.id} ({job.kind}) has no similarity result.")
     if job.state in UNFINISHED_STATES:
         raise Conflict(
@@ -167,8 +126,7 @@ async def read_similarity_result(
             job_id=str(job.id),
             state=job.state,
         )
-    wait = gateway.settings.compare_wait_seconds
-    return await _wait_for_result(gateway, response, job, query.map, wait)
+    return _result_of(gateway, job)
 
 
 @router.get(
@@ -197,26 +155,6 @@ def read_query_preview(gateway: GatewayDep, job_id: JobId, query: MapQuery) -> R
     return Response(data, media_type="image/jpeg", headers={"Cache-Control": "private, no-cache"})
 
 
-async def _wait_for_result(
-    gateway: GatewayContext, response: Response, job: Job, map_name: str, wait_seconds: float
-) -> SimilarityResponse | JSONResponse:
-    """Wait for the query's job and its compare job, if any; 202 with the job when time is up."""
-    deadline = time.monotonic() + wait_seconds
-    while True:
-        remaining = deadline - time.monotonic()
-        if job.state in UNFINISHED_STATES and remaining > 0:
-            current = await wait_for_job(gateway, job.id, remaining)
-            if current is None:
-                raise query_expired_error()
-            job = current
-        if job.state in UNFINISHED_STATES:
-            return JobAcceptedResponse.of(job, map_name).to_http(response.headers)
-        result = await run_in_threadpool(_result_or_next_job, gateway, job, map_name)
-        if isinstance(result, SimilarityResponse):
-            return result
-        job = result
-
-
 def _queue_query(
     gateway: GatewayContext,
     map_name: str,
@@ -232,25 +170,18 @@ def _queue_query(
         with upload.open(gateway.store) as photo:
             read_photo_header(photo, gateway.settings.max_image_pixels)
         with gateway.catalog.write() as session:
-            map_id = get_map(session, map_name).id
-            job = describe_query_job(job_id, map_id, upload.filename, search_params)
+            map_ = get_map(session, map_name)
+            check_matching_enabled(map_, search_params)
+            job = describe_query_job(job_id, map_.id, upload.filename, search_params)
             idempotent.store_job_response(session, job)
     gateway.wakeups.send(WakeupQueue.QUERY)
     return job
 
 
-def _result_or_next_job(
-    gateway: GatewayContext, job: Job, map_name: str
-) -> SimilarityResponse | Job:
-    """The result of a finished job, or the compare job that continues it."""
+def _result_of(gateway: GatewayContext, job: Job) -> SimilarityResponse:
+    """The result of a finished query job."""
     if job.state == JobState.SUCCEEDED:
-        if job.kind == JobKind.COMPARE:
-            return comparison_response(gateway, job, map_name)
-        search_params = query_job_search_params(job)
-        query = query_from_job(gateway, job)
-        if search_params.needs_comparison:
-            return start_comparison_of_query_photo(gateway, job, query, search_params)
-        return find_similar(gateway, query, search_params)
+        return find_similar(gateway, query_from_job(gateway, job), query_job_search_params(job))
     if job.state == JobState.CANCELLED:
         raise Conflict("job_cancelled", f"The job {job.id} was cancelled.", job_id=str(job.id))
     error = job.error or {}

@@ -8,10 +8,9 @@ The module also selects the word weights that a search ranks by (`select_ranking
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 from uuid import UUID
@@ -27,11 +26,18 @@ from services.gateway.schemas import (
     job_url,
 )
 from services.gateway.similarity.estimate import estimate_place, locate_hits
+from services.gateway.similarity.matches import (
+    MATCHING_IS_OFF,
+    NO_MATCHES,
+    QueryMatches,
+    check_matching_enabled,
+    match_photos,
+)
 from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import find_descriptor
 from shared.catalog.database.errors import to_unavailable
 from shared.catalog.generations import Generation, RowType, active_generation
-from shared.catalog.maps import Map, Search, get_map, map_not_found_error
+from shared.catalog.maps import Map, Matching, Search, get_map, map_not_found_error
 from shared.catalog.photos import Photo, get_live_photos, get_photo
 from shared.catalog.vocabularies import vocabulary_standing
 from shared.errors import Conflict, Gone, StorageFull
@@ -40,7 +46,15 @@ from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import PlaceModel
 from shared.jobs import Job, JobState
 from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
-from shared.search_api.protocol import Mode, RowReference, SearchHit, SearchRequest, SearchResponse
+from shared.search_api.protocol import (
+    FeatureReference,
+    Mode,
+    RowReference,
+    SearchHit,
+    SearchRequest,
+    SearchResponse,
+)
+from shared.storage.chunks import features_key
 from shared.word_weights.record import WordWeights, parse_word_weights
 
 log = logging.getLogger(__name__)
@@ -94,21 +108,10 @@ class SimilarityQuery:
     background: tuple[RowReference, ...] = ()
     """Descriptors whose mean is subtracted from the query"""
 
-
-@dataclass(frozen=True, slots=True)
-class SimilarityResult:
-    """Result of a search: the response without photos, the hits and the history row."""
-
-    response_without_photos: SimilarityResponse
-    hits: list[SearchHit]
-    """Live photos, most similar first: `top_k`, or more if more are to be reranked."""
-    photos: dict[UUID, Photo]
-    match_probabilities: dict[UUID, float]
-    """Probability of each of the best photos with a place that it shows the query's."""
-    word_weights: tuple[float, ...]
-    """The weights that the hits are ranked by, one per word; () for the plain ranking."""
-    history: tuple[Search, ...]
-    """Row of the search history, which the caller adds to a session; () if it is left out."""
+    @property
+    def features(self) -> FeatureReference:
+        """The query's local features; they may not exist."""
+        return FeatureReference(object_key=features_key(self.object_key), row=self.row)
 
 
 def query_from_photo(gateway: GatewayContext, map_name: str, photo_id: UUID) -> SimilarityQuery:
@@ -172,106 +175,71 @@ def find_similar(
 
     Raises:
         NotFound: `map_not_found` if the map was deleted meanwhile.
+        Unprocessable: `matching_off`.
     """
-    result = run_similarity_search(gateway, query, search_params)
+    response, history = run_similarity_search(gateway, query, search_params)
+    if not search_params.history:
+        return response
     try:
-        with write_to_map(gateway, query.map) as session:
-            session.add_all(result.history)
+        with gateway.catalog.write() as session:
+            session.add(history)
+    except IntegrityError:
+        with gateway.catalog.read() as session:
+            if session.get(Map, query.map.id) is None:
+                raise map_not_found_error(query.map.name) from None
+        raise
     except SQLAlchemyError as error:
         if not isinstance(to_unavailable(error), StorageFull):
             raise
         log.warning("the search is not added to the history: the disk of the catalog is full")
-    return result.response_without_photos.with_photos(
-        SimilarPhotoResponse.of(
-            result.photos[hit.photo_id],
-            query.map.name,
-            similarity_score=hit.score,
-            weighted_score=hit.weighted_score,
-            match_probability=result.match_probabilities.get(hit.photo_id),
-        )
-        for hit in result.hits
-    )
-
-
-@contextlib.contextmanager
-def write_to_map(gateway: GatewayContext, map_: Map) -> Iterator[Session]:
-    """Open a transaction that adds rows of a map that was read in an earlier one.
-
-    Raises:
-        NotFound: `map_not_found` if the map was deleted meanwhile, and its row is gone.
-    """
-    try:
-        with gateway.catalog.write() as session:
-            yield session
-    except IntegrityError:
-        with gateway.catalog.read() as session:
-            if session.get(Map, map_.id) is None:
-                raise map_not_found_error(map_.name) from None
-        raise
+    return response
 
 
 def run_similarity_search(
     gateway: GatewayContext, query: SimilarityQuery, search_params: SearchParams
-) -> SimilarityResult:
-    """Query the search tier and estimate the place. The caller adds the history row.
+) -> tuple[SimilarityResponse, Search]:
+    """Rank the photos, match the best ones, estimate the place, and make response and history row.
 
     One search answers most queries. Further ones are made for photos without a place among the
     first, for a filter (the estimate is that of the whole map), for the neighbours of a best photo
     that are not cached, and for `min_score` with word weights.
     """
     started = time.perf_counter()
-    settings, photo_filter = gateway.settings, search_params.photos
+    check_matching_enabled(query.map, search_params)
     weights = select_ranking_weights(query.generation, search_params.word_weights)
     search = _MapSearch(gateway, query, search_params.mode, weights.values)
-
-    # The estimate needs EVIDENCE_DEPTH hits, also those below `min_score`.
-    depth = max(search_params.top_k, search_params.rerank or 0)
-    found = search.find(photo_filter, max(depth, EVIDENCE_DEPTH))
-    located = found
-    if not all(ranked.location.is_known for ranked in found.ranking):
-        with_place = photo_filter.model_copy(update={"has_place": True})
-        located = search.find(with_place, len(found.hits))
-    whole_map = located if photo_filter.is_empty else search.find(WITH_PLACE, EVIDENCE_DEPTH)
-    similar = _first_similar(search, found, search_params, depth)
-
-    scheme = LevelScheme(
-        labels_are_paths=query.map.place_labels_are_paths, radii_m=settings.level_radii_m
+    rankings = _rank_photos(search, search_params)
+    matches = _match_best_photos(search, rankings, search_params)
+    estimate, probabilities = _estimate(search, rankings, matches, weights, search_params)
+    similar = rankings.similar
+    hits = matches.rerank(similar.hits, search_params.rerank or 0)[: search_params.top_k]
+    response = SimilarityResponse.of_row(
+        similar.response,
+        query_file_id=query.photo_id,
+        query_filename=query.filename,
+        processing_time_ms=(time.perf_counter() - started) * 1000,
+        total_similar=0,
+        similar_images=[],
+        estimate=estimate,
+        matches=matches.response,
+        vocabulary=query.vocabulary,
+        word_weights=weights.state(rankings.found.hits),
+        generation_id=query.generation.id,
+        rows=RowType(query.generation.row_type),
+        degraded=bool(similar.response.missing),
+    ).with_photos(
+        SimilarPhotoResponse.of(
+            similar.photos[hit.photo_id],
+            query.map.name,
+            similarity_score=hit.score,
+            weighted_score=hit.weighted_score,
+            match_probability=probabilities.get(hit.photo_id),
+            inliers=matches.inliers(hit.photo_id),
+            pairs=matches.pairs(hit.photo_id) if search_params.explain else None,
+        )
+        for hit in hits
     )
-    model = (weights.calibration(found.hits) or PlaceModel()).for_scheme(scheme)
-    certainty = search_params.certainty or settings.certainty
-    neighbours = search.rank_neighbours(whole_map.hits[0].photo_id) if whole_map.hits else ()
-    places = model.estimate(
-        whole_map.ranking,
-        [ranked for ranked in neighbours if ranked.photo != query.photo_id],
-        scheme,
-        certainty,
-        settings.estimate_radius_m,
-        located.ranking,
-    )
-    estimate = estimate_place(
-        places,
-        certainty,
-        settings.estimate_radius_m,
-        _no_place_reason(found.hits, photo_filter),
-    )
-    match_probabilities: dict[UUID, float] = {}
-    if places is not None and model.is_fitted:
-        best = (hit.photo_id for hit in located.hits)
-        match_probabilities = dict(zip(best, places.match_probabilities, strict=True))
-    response = _make_response(
-        query, similar.response, estimate, weights.state(found.hits), time.perf_counter() - started
-    )
-    is_weighted = any(hit.weighted_score is not None for hit in similar.hits)
-    return SimilarityResult(
-        response_without_photos=response,
-        hits=similar.hits,
-        photos=similar.photos,
-        match_probabilities=match_probabilities,
-        word_weights=weights.values if is_weighted else (),
-        history=(_make_history(query, search_params, found, similar, response),)
-        if search_params.history
-        else (),
-    )
+    return response, _make_history(query, search_params, rankings.found, response)
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,6 +252,20 @@ class _Found:
     response: SearchResponse
     ranking: list[RankedPhoto]
     """the hits with the locations of their photos"""
+
+
+@dataclass(frozen=True, slots=True)
+class _Rankings:
+    """The rankings that a response is made of."""
+
+    found: _Found
+    """the photos that pass the filter, at least EVIDENCE_DEPTH if there are as many"""
+    located: _Found
+    """those of them that have a place"""
+    whole_map: _Found
+    """photos with a place, whatever the filter"""
+    similar: _Found
+    """the photos to return, or to choose from by their matches"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -352,6 +334,20 @@ class _MapSearch:
         return found.ranking
 
 
+def _rank_photos(search: _MapSearch, search_params: SearchParams) -> _Rankings:
+    # The estimate needs EVIDENCE_DEPTH hits, also those below `min_score`.
+    photo_filter = search_params.photos
+    depth = max(search_params.top_k, search_params.rerank or 0)
+    found = search.find(photo_filter, max(depth, EVIDENCE_DEPTH))
+    located = found
+    if not all(ranked.location.is_known for ranked in found.ranking):
+        with_place = photo_filter.model_copy(update={"has_place": True})
+        located = search.find(with_place, len(found.hits))
+    whole_map = located if photo_filter.is_empty else search.find(WITH_PLACE, EVIDENCE_DEPTH)
+    similar = _first_similar(search, found, search_params, depth)
+    return _Rankings(found, located, whole_map, similar)
+
+
 def _first_similar(
     search: _MapSearch, found: _Found, search_params: SearchParams, depth: int
 ) -> _Found:
@@ -364,34 +360,65 @@ def _first_similar(
     return replace(first, hits=[hit for hit in first.hits if hit.score >= min_score])
 
 
-def _make_response(
-    query: SimilarityQuery,
-    response: SearchResponse,
-    estimate: EstimateResponse,
-    word_weights: str,
-    elapsed_seconds: float,
-) -> SimilarityResponse:
-    return SimilarityResponse.of_row(
-        response,
-        query_file_id=query.photo_id,
-        query_filename=query.filename,
-        processing_time_ms=elapsed_seconds * 1000,
-        total_similar=0,
-        similar_images=[],
-        estimate=estimate,
-        vocabulary=query.vocabulary,
-        word_weights=word_weights,
-        generation_id=query.generation.id,
-        rows=RowType(query.generation.row_type),
-        degraded=bool(response.missing),
+def _match_best_photos(
+    search: _MapSearch, rankings: _Rankings, search_params: SearchParams
+) -> QueryMatches:
+    """Match the best photos of the result and, where they count, of the estimate."""
+    query = search.query
+    is_on = query.map.matching != Matching.OFF
+    are_evidence = is_on and bool(query.generation.uses_matches)
+    count = search_params.photos_to_match(by_default=are_evidence)
+    if count == 0:
+        return NO_MATCHES
+    if not is_on:
+        return MATCHING_IS_OFF
+    best = [rankings.found, rankings.similar, *([rankings.whole_map] if are_evidence else [])]
+    photo_ids = dict.fromkeys(hit.photo_id for ranking in best for hit in ranking.hits[:count])
+    return match_photos(
+        search.gateway, query.generation, query.features, list(photo_ids), search_params.explain
     )
+
+
+def _estimate(
+    search: _MapSearch,
+    rankings: _Rankings,
+    matches: QueryMatches,
+    weights: _RankingWeights,
+    search_params: SearchParams,
+) -> tuple[EstimateResponse, dict[UUID, float]]:
+    """Return the place estimate, and the probabilities that photos show the query's place."""
+    query, settings = search.query, search.gateway.settings
+    found, whole_map = rankings.found, rankings.whole_map
+    scheme = LevelScheme(
+        labels_are_paths=query.map.place_labels_are_paths, radii_m=settings.level_radii_m
+    )
+    model = (weights.calibration(found.hits) or PlaceModel()).for_scheme(scheme)
+    certainty = search_params.certainty or settings.certainty
+    neighbours = search.rank_neighbours(whole_map.hits[0].photo_id) if whole_map.hits else ()
+    places = model.estimate(
+        matches.add_to(whole_map.ranking),
+        [ranked for ranked in neighbours if ranked.photo != query.photo_id],
+        scheme,
+        certainty,
+        settings.estimate_radius_m,
+        matches.add_to(rankings.located.ranking),
+    )
+    estimate = estimate_place(
+        places,
+        certainty,
+        settings.estimate_radius_m,
+        _no_place_reason(found.hits, search_params.photos),
+    )
+    if places is None or not model.is_fitted:
+        return estimate, {}
+    best = (hit.photo_id for hit in rankings.located.hits)
+    return estimate, dict(zip(best, places.match_probabilities, strict=True))
 
 
 def _make_history(
     query: SimilarityQuery,
     search_params: SearchParams,
     found: _Found,
-    similar: _Found,
     response: SimilarityResponse,
 ) -> Search:
     estimate = response.estimate
@@ -401,7 +428,7 @@ def _make_history(
         query_photo_id=query.photo_id,
         query_filename=query.filename,
         top_k=search_params.top_k,
-        results=min(len(similar.hits), search_params.top_k),
+        results=response.total_similar,
         processing_ms=response.processing_time_ms,
         best_score=found.hits[0].score if found.hits else None,
         in_map=estimate.in_map,

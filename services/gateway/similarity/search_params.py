@@ -15,11 +15,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from services.gateway.dependencies import MapParams
 from shared.errors import invalid_field_error
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS, parse_tags, parse_time
-from shared.search_api.comparison import MAX_RERANK_CANDIDATES
 from shared.search_api.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
-from shared.search_api.protocol import Mode
+from shared.search_api.protocol import MAX_MATCHED_PHOTOS, Mode
 
 TIME = "ISO 8601; no offset means UTC"
+DEFAULT_MATCHES = 10
 MAX_IDS = 1000
 MAX_IDS_CHARACTERS = 40_000
 
@@ -146,14 +146,21 @@ class RankingParams(BaseModel):
     word_weights: bool = Field(
         True, description="Rank by the word weights of the map, if it has any."
     )
+    matches: int | None = Field(
+        None,
+        ge=0,
+        le=MAX_MATCHED_PHOTOS,
+        description="Match the local features of the first N photos with the query's. Default: 10 "
+        "if matches improve the answers of the map, and with `explain`; 0 otherwise.",
+    )
     rerank: int | None = Field(
         None,
         ge=1,
-        le=MAX_RERANK_CANDIDATES,
-        description="Compare the first N photos with the query patch by patch, and rerank them.",
+        le=MAX_MATCHED_PHOTOS,
+        description="Match the first N photos, and order them by the number of matching points.",
     )
     explain: bool = Field(
-        False, description="Return the clusters and patches that contribute to each similarity."
+        False, description="Return the matching points of each photo that was matched."
     )
     certainty: float | None = Field(
         None,
@@ -173,10 +180,10 @@ class RankingParams(BaseModel):
         "every row. Both return the same photos.",
     )
 
-    @property
-    def needs_comparison(self) -> bool:
-        """Whether an extractor must compare the query with the found photos."""
-        return self.rerank is not None or self.explain
+    def photos_to_match(self, by_default: bool) -> int:
+        """Return how many photos to match; `by_default`: also if the request names no number."""
+        default = DEFAULT_MATCHES if by_default or self.explain else 0
+        return max(default if self.matches is None else self.matches, self.rerank or 0)
 
 
 class SearchParams(RankingParams):

@@ -21,6 +21,7 @@ from services.gateway.dependencies import GatewayContext
 from services.gateway.similarity.execute import query_from_job, rank_live_photos
 from services.gateway.tracks.catalog_graph import CatalogPhotoGraph
 from services.gateway.tracks.schemas import FrameForm, TrackParams, TrackStateResponse
+from services.gateway.uploads.query_photo import query_expired_error
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import Map
 from shared.catalog.tracks import (
@@ -41,7 +42,6 @@ from shared.jobs import Job, JobState
 from shared.jobs.transitions import requeue_job_as_new
 from shared.jobs.wakeups import WakeupQueue
 from shared.search_api.background import background_frames
-from shared.search_api.comparison import query_expired_error
 from shared.search_api.protocol import RowReference
 from shared.tracks.belief import Belief
 from shared.tracks.evidence import HITS, FrameEvidence, frame_evidence

@@ -12,6 +12,7 @@ from services.gateway.admission import AdmissionControl, UploadKind
 from services.gateway.dependencies import GatewayContext
 from services.gateway.similarity.search_params import SearchParams
 from services.gateway.uploads.multipart import FormFile, receive_form_file
+from shared.errors import Gone
 from shared.ids import new_id
 from shared.ingest.validation import check_photo_signature
 from shared.jobs import Job, JobKind, Priority
@@ -54,3 +55,8 @@ def describe_query_job(
 def query_job_search_params(job: Job) -> SearchParams:
     """Return the parameters that `describe_query_job` has stored."""
     return SearchParams.model_validate(job.params["search_params"])
+
+
+def query_expired_error() -> Gone:
+    """Return the error for a query whose job has been deleted."""
+    return Gone("query_expired", "The query has expired: it is kept for an hour. Send it again.")

@@ -16,7 +16,7 @@ from services.steward.periodic_tasks import periodic_task
 from services.steward.tasks.auto_fit import is_fit_due
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, active_generation, latest_evaluation
-from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES
+from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import Map, get_map_statistics, list_maps, lock_map
 from shared.catalog.vocabularies import vocabulary_standing, word_weights_unavailable_reason
 from shared.config.settings import Settings
@@ -95,7 +95,7 @@ def _due_job(session: Session, map_id: UUID, min_photos: int) -> DueJob | None:
 def _is_busy(session: Session, map_id: UUID) -> bool:
     """Return whether the map has unfinished jobs other than queries, which may change results."""
     unfinished = exists().where(
-        Job.map_id == map_id, Job.state.in_(UNFINISHED_STATES), Job.kind.not_in(QUERY_JOBS)
+        Job.map_id == map_id, Job.state.in_(UNFINISHED_STATES), Job.kind != JobKind.DESCRIBE
     )
     return bool(session.scalar(select(unfinished)))
 

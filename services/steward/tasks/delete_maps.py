@@ -27,7 +27,7 @@ from shared.catalog.chunks import Chunk, Descriptor, delete_chunk_rows
 from shared.catalog.database.base import affected_rows, is_journaled
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Evaluation, Generation
-from shared.catalog.jobs import QUERY_JOBS, Job, JobKind
+from shared.catalog.jobs import Job, JobKind
 from shared.catalog.maps import CachedMapStatistics, Map, Search
 from shared.catalog.photos import Photo, PresignedUpload
 from shared.catalog.tracks import Track, delete_tracks
@@ -117,7 +117,7 @@ def _purge_queries(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
         catalog,
         store,
         select(Job.id)
-        .where(Job.map_id == map_id, Job.kind.in_(QUERY_JOBS))
+        .where(Job.map_id == map_id, Job.kind == JobKind.DESCRIBE)
         .limit(ROWS_PER_TRANSACTION),
         query_object_keys,
         lambda session, ids: session.execute(delete(Job).where(Job.id.in_(ids))),

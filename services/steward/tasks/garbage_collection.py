@@ -24,7 +24,7 @@ from shared.catalog.chunks import Chunk, Descriptor, delete_chunk_rows
 from shared.catalog.database.base import Condition, db_now, db_now_plus, is_journaled
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.jobs import QUERY_JOBS, QUERY_TTL_SECONDS, UNFINISHED_STATES, Job, JobKind
+from shared.catalog.jobs import QUERY_TTL_SECONDS, UNFINISHED_STATES, Job, JobKind
 from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.photos import Photo, PresignedUpload
 from shared.catalog.tracks import TrackFrame, is_pending
@@ -223,7 +223,7 @@ def _delete_photo_rows(session: Session, grace_seconds: float) -> None:
 
 
 def collect_queries(catalog: Catalog, store: ObjectStore, ttl_seconds: float) -> None:
-    """Delete query and comparison jobs with their photos and descriptors after QUERY_TTL.
+    """Delete query jobs with their photos and descriptors after QUERY_TTL.
 
     Jobs of pending frames stay until their frame is applied, or the track is deleted.
     """
@@ -233,7 +233,7 @@ def collect_queries(catalog: Catalog, store: ObjectStore, ttl_seconds: float) ->
         catalog,
         store,
         select(Job.id)
-        .where(Job.kind.in_(QUERY_JOBS), is_old, ~awaited_by_frame)
+        .where(Job.kind == JobKind.DESCRIBE, is_old, ~awaited_by_frame)
         .limit(ROWS_PER_TRANSACTION),
         query_object_keys,
         lambda session, ids: session.execute(delete(Job).where(Job.id.in_(ids))),

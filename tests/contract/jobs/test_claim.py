@@ -45,7 +45,7 @@ def test_higher_priority_goes_first_and_then_age(catalog: Catalog, map_id: UUID)
         (JobKind.FIT, 3),
         (JobKind.INDEX, 2),
         (JobKind.DESCRIBE, 1),
-        (JobKind.COMPARE, 1),
+        (JobKind.DESCRIBE, 1),
     ]
     made = [(place, queue(catalog, map_id, kind=kind)[0]) for kind, place in expected]
     order = [job_id for _, job_id in sorted(made, key=lambda pair: pair[0])]

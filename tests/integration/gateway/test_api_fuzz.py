@@ -77,8 +77,7 @@ def fuzzed(
     """A service that waits for nothing, with photos that can be found."""
     monkeypatch.setattr("services.gateway.dependencies.MAX_WAIT_SECONDS", 0.0)
     monkeypatch.setattr("services.gateway.routes.jobs.MAX_WAIT_SECONDS", 0.0)
-    quick = {"compare_wait_seconds": 0.0}
-    door = Door(catalog, store, settings.model_copy(update=quick))
+    door = Door(catalog, store, settings)
     for number in (1, 2, 3):
         assert door.put(ADMIN, number).status_code == 202
     make_worker().drain(threading.Event())

@@ -105,13 +105,11 @@ def test_jobs_of_a_deleted_map_are_cancelled_in_small_transactions(
     assert rows(catalog)["jobs"] == 0
 
 
-@pytest.mark.parametrize("params", [{}, {"rerank": 1}])
 def test_a_search_whose_map_is_removed_meanwhile_finds_no_map(
     service: Service,
     catalog: Catalog,
     store: FolderStore,
     monkeypatch: pytest.MonkeyPatch,
-    params: dict[str, Any],
 ) -> None:
     service.json("POST", "/maps", 201, json={"name": "gone", "extractor": "test-tiny-avg"})
     photo_id, _ = service.indexed(1, 2, map_name="gone")
@@ -122,10 +120,9 @@ def test_a_search_whose_map_is_removed_meanwhile_finds_no_map(
         remove_all(catalog, store)
         return result
 
-    module = "rerank" if params else "execute"
-    path = f"services.gateway.similarity.{module}.run_similarity_search"
+    path = "services.gateway.similarity.execute.run_similarity_search"
     monkeypatch.setattr(path, search_and_remove)
-    answer = service("POST", f"/similarity/{photo_id}", params={"map": "gone", **params})
+    answer = service("POST", f"/similarity/{photo_id}", params={"map": "gone"})
     problem(answer, 404, "map_not_found")
 
 

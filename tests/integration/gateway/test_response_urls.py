@@ -120,8 +120,6 @@ def test_every_url_in_an_answer_leads_to_its_map(service: Service) -> None:
     searched = call("similar_to_upload", "POST", "/similarity", files=query)
     call.until_it_ends(searched)
     call("similarity_result", "GET", f"/jobs/{searched['job_id']}/result")
-    compared = call("similar_to_stored", "POST", f"/similarity/{file_id}", params={"rerank": 2})
-    call.until_it_ends(compared)
 
     track = (
         f"/tracks/{service.json('POST', '/tracks', 201, params={'map': MAP}, json={})['track_id']}"

@@ -21,7 +21,7 @@ from services.gateway import schemas
 from services.gateway.routes import batches, evaluations, keys, maps, models, positions, tracks
 from services.gateway.routes import stats as stats_module
 from services.gateway.tracks.schemas import TrackStateResponse
-from shared.search_api.comparison import ClusterContribution, SimilarityExplanation
+from shared.search_api.protocol import PointPair
 from tests.support.api_responses import JOB, PHOTO, SIMILAR, STARTED, UPLOADED
 from tests.support.fake_server import FakeServer
 
@@ -32,8 +32,8 @@ SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
     (answers.Uploaded, schemas.UploadResponse),
     (answers.Similar, schemas.SimilarityResponse),
     (answers.Estimate, schemas.EstimateResponse),
-    (answers.Explanation, SimilarityExplanation),
-    (answers.ClusterShare, ClusterContribution),
+    (answers.Matches, schemas.MatchesResponse),
+    (answers.PointPair, PointPair),
     (answers.TrackState, TrackStateResponse),
     (answers.Track, tracks.TrackResponse),
     (answers.OneTrack, tracks.TrackDetailResponse),
