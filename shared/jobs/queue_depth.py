@@ -71,7 +71,7 @@ class QueueDepth:
     jobs_by_map: Mapping[str, int]
     """Map name -> number of its jobs, without queries."""
     queries: int
-    """Number of query photos and comparisons of all maps."""
+    """Number of query photos of all maps."""
     finished_per_second: float
     """Uploads and queries that succeeded or failed in the last THROUGHPUT_WINDOW_SECONDS."""
 
