@@ -10,7 +10,8 @@ from rich.markup import escape
 from rich.progress_bar import ProgressBar
 from rich.table import Column
 
-from placewise.answers import Estimate, EstimateLevel, Matches
+from placewise.answers import Estimate, EstimateLevel, Matches, Similar
+from placewise.client import Client
 from services.cli.client import connect, describe_target
 from services.cli.output import (
     JsonOption,
@@ -18,11 +19,16 @@ from services.cli.output import (
     MapOption,
     ServerOption,
     Table,
+    atomic_write,
+    check_output_path,
     format_percent,
     print_json,
     print_message,
+    print_note,
     print_table,
+    printable_path,
 )
+from shared.errors import PlacewiseError
 from shared.search_api.protocol import MAX_MATCHED_PHOTOS
 
 BAR_WIDTH = 20  # characters
@@ -80,6 +86,14 @@ def query(
             metavar="N",
         ),
     ] = None,
+    explain: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.png",
+            help="Draw PHOTO beside each result that was matched, with lines between the matching "
+            "points.",
+        ),
+    ] = None,
     certainty: Annotated[
         float | None,
         typer.Option(
@@ -94,6 +108,8 @@ def query(
     as_json: JsonOption = False,
 ) -> None:
     """Find the indexed photos most similar to PHOTO. The query photo is not stored."""
+    if explain:
+        check_output_path(explain, ".png", "a drawing of matches")
     with connect(server, map_name, key) as client:
         answer = client.similar(
             photo,
@@ -101,6 +117,7 @@ def query(
             min_score=min_score,
             matches=matches,
             rerank=rerank,
+            explain=explain is not None,
             near=near,
             box=box,
             captured_after=captured_after,
@@ -112,6 +129,8 @@ def query(
             certainty=certainty,
         )
         target = describe_target(client, server, map_name)
+        if explain:
+            _draw_matches(client, photo, answer, explain)
     if as_json:
         print_json(answer)
         return
@@ -153,6 +172,45 @@ def query(
         f"vocabulary: {answer.vocabulary}, word weights: {answer.word_weights}\n"
         f"Searched {target}"
     )
+
+
+def _draw_matches(client: Client, photo: Path, answer: Similar, out: Path) -> None:
+    """Draw the query beside each photo that was matched, best first, below each other.
+
+    Raises:
+        Unprocessable: `photo_not_drawable`.
+    """
+    from services.cli import (
+        match_drawing,  # imports NumPy, which the command needs for nothing else
+    )
+
+    matches = answer.matches
+    if not matches or not matches.compared or not matches.query_width or not matches.query_height:
+        print_note(f"{printable_path(out)} was not drawn: no photo was matched.")
+        return
+    query_size = (matches.query_width, matches.query_height)
+    query = match_drawing.read_photo(photo.read_bytes(), printable_path(photo))
+    drawings = []
+    for rank, match in enumerate(answer.similar_images, start=1):
+        if match.pairs is None:
+            continue
+        name = match.relative_path or match.original_filename
+        try:
+            original = client.image(match.image_id)
+        except PlacewiseError as error:
+            raise match_drawing.photo_not_drawable_error(name, error) from error
+        drawings.append(
+            match_drawing.draw_matches(
+                query,
+                match_drawing.read_photo(original, name),
+                match.pairs,
+                query_size,
+                (match.width, match.height),
+                f"{rank}. {name}: {len(match.pairs)} matching points",
+            )
+        )
+    with atomic_write(out) as file:
+        match_drawing.stack(drawings).save(file, "PNG")
 
 
 def _format_score(value: float | None) -> str:

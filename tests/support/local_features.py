@@ -63,6 +63,5 @@ def add_features(
             described = select(Descriptor).where(Descriptor.chunk_id == chunk.id)
             for descriptor in session.scalars(described):
                 rows[descriptor.row] = photos.get(descriptor.photo_id)
-            if any(rows):
-                put_features(store, *rows, model=model, key=features_key(chunk.object_key))
-                chunk.features_model = model
+            put_features(store, *rows, model=model, key=features_key(chunk.object_key))
+            chunk.features_model = model

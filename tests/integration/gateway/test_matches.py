@@ -11,6 +11,7 @@ from shared.catalog.chunks import Chunk
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map, Matching
 from shared.matching.features import LocalFeatures
+from shared.storage.chunks import features_key
 from shared.storage.keys import query_features_key
 from tests.integration.in_process_api import Service
 from tests.support.local_features import (
@@ -156,17 +157,17 @@ def test_query_without_usable_features_is_answered_with_the_reason(
 def test_features_that_cannot_be_used_leave_the_answer_as_without_them(
     service: Service, ids: list[str], damage: str
 ) -> None:
-    (key,) = [info.key for info in service.store.list("chunks/") if info.key.endswith(".features")]
-    if damage == "another model":
-        rows = [scene_features(1)] * PHOTOS
-        put_features(service.store, *rows, key=key, model="aliked-n16@0123456789ab")
-    elif damage == "truncated":
-        service.store.put(key, service.store.get(key)[:50])
-    elif damage == "no file":
-        service.store.delete(key)
-    else:
-        with service.catalog.write() as session:
-            for chunk in session.query(Chunk):
+    with service.catalog.write() as session:
+        for chunk in session.query(Chunk):
+            key = features_key(chunk.object_key)
+            if damage == "another model":
+                rows = [scene_features(1)] * chunk.rows
+                put_features(service.store, *rows, key=key, model="aliked-n16@0123456789ab")
+            elif damage == "truncated":
+                service.store.put(key, service.store.get(key)[:50])
+            elif damage == "no file":
+                service.store.delete(key)
+            else:
                 chunk.features_model = None
     plain, answer = (ask(service, scene_features(1), **params) for params in ({}, {"rerank": 5}))
     assert list(inliers_of(answer)) == list(inliers_of(plain))
