@@ -144,6 +144,12 @@ def _print_evaluations(evaluations: list[Evaluation], vocabularies: dict[UUID, s
     used = figures["with_word_weights"] or figures
     if places := used["places"]:
         print_table(answers_table(places))
+    if with_matches := used["places_with_matches"]:
+        print_message(
+            "With matches of local features, which "
+            + ("are used:" if used["uses_matches"] else "are not used, as they answer no more:")
+        )
+        print_table(answers_table(with_matches))
     for line in _estimate_lines(used):
         print_message(line)
 

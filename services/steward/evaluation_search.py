@@ -1,4 +1,4 @@
-"""Search client of evaluations: ranks a map's own geotagged photos through the search tier.
+"""Search client of evaluations: ranks and matches a map's own photos through the search tier.
 
 Also the index of geotagged photos, which finds those that show a given place, and tells whether two
 photos are frames of one sequence.
@@ -18,16 +18,24 @@ import sqlalchemy as sql
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from shared.catalog.chunks import Descriptor, find_descriptor
+from shared.catalog.chunks import Descriptor, find_descriptor, find_feature_rows
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.photos import Photo, PhotoRole, is_geotagged
 from shared.config.shards import is_shard_name
 from shared.errors import Conflict, Gone, Unavailable
-from shared.evaluation.places.evidence import PhotoLocation
+from shared.evaluation.places.evidence import PhotoLocation, match_support
 from shared.geodesy import distances_m, latitude_bounds
 from shared.search_api.photo_filter import PhotoFilter
-from shared.search_api.protocol import SearchBackend, SearchHit, SearchRequest
+from shared.search_api.protocol import (
+    FeatureReference,
+    MatchRequest,
+    PhotoMatches,
+    SearchBackend,
+    SearchHit,
+    SearchRequest,
+)
+from shared.storage.chunks import features_key
 
 SEQUENCE_PERIOD = timedelta(seconds=60)
 SEQUENCE_NUMBERS = 60
@@ -151,6 +159,36 @@ class EvaluationSearch:
     generation: Generation
     version: int
     photos: Mapping[UUID, GeotaggedPhoto]
+    _supports: dict[frozenset[UUID], float | None] = field(default_factory=dict)
+    """match support of the pairs of photos that were compared"""
+
+    def match(self, photo_id: UUID, others: Sequence[UUID]) -> list[float | None]:
+        """Return the `match_support` of a photo with each of others, which are compared once.
+
+        None where one of the two has no local features.
+        """
+        pairs = [frozenset((photo_id, other)) for other in others]
+        new = [
+            other for other, pair in zip(others, pairs, strict=True) if pair not in self._supports
+        ]
+        if new:
+            with self.catalog.read() as session:
+                rows = find_feature_rows(session, self.generation.id, [photo_id, *new])
+            found: dict[UUID, PhotoMatches | None] = {}
+            query = rows.pop(photo_id, None)
+            if query is not None and rows:
+                references = [
+                    FeatureReference(object_key=features_key(key), row=row)
+                    for key, row in (query, *rows.values())
+                ]
+                request = MatchRequest(query=references[0], candidates=tuple(references[1:]))
+                found = dict(zip(rows, self.search.match(request).candidates, strict=False))
+            for other in new:
+                matches = found.get(other)
+                self._supports[frozenset((photo_id, other))] = (
+                    None if matches is None else match_support(matches.matches, matches.inliers)
+                )
+        return [self._supports[pair] for pair in pairs]
 
     def rank_similar(
         self,

@@ -19,7 +19,7 @@ from services.steward.word_weights import WordWeightsFit
 from shared.catalog.chunks import count_searchable
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Evaluation, Generation, active_generation
-from shared.catalog.maps import Map, decide_label_paths
+from shared.catalog.maps import Map, Matching, decide_label_paths
 from shared.catalog.vocabularies import Vocabulary, word_weights_unavailable_reason
 from shared.config.settings import Settings
 from shared.errors import Conflict
@@ -83,6 +83,7 @@ class EvaluationWorker:
             generation,
             radius_m,
             LevelScheme(labels_are_paths=labels_are_paths, radii_m=self._settings.level_radii_m),
+            map_.matching if job.kind == JobKind.EVALUATE else Matching.OFF,
             progress.advance,
         )
         if job.kind == JobKind.WORD_WEIGHTS:
@@ -101,7 +102,8 @@ class EvaluationWorker:
         record = parse_word_weights(generation.word_weights)
         weights = record.applied if record else ()
         sample = evaluation.draw_sample(job.params["sample"], job.params["seed"])
-        progress.total = (len(sample) + len(evaluation.queries)) * (2 if weights else 1)
+        searched = len(sample) + len(evaluation.queries) + evaluation.matched_photos(sample)
+        progress.total = searched * (2 if weights else 1)
         unweighted = evaluation.evaluate(sample)
         weighted = evaluation.evaluate(sample, weights) if weights else None
         figures = {
@@ -119,6 +121,7 @@ class EvaluationWorker:
                 map_.place_labels_are_paths = evaluation.scheme.labels_are_paths
             current = session.get_one(Generation, generation.id)
             current.calibration = unweighted.model.model_dump(mode="json")
+            current.uses_matches = (weighted or unweighted).uses_matches
             # Unless the weights changed meanwhile.
             record = parse_word_weights(current.word_weights)
             if weighted and record and record.applied == weights:

@@ -7,6 +7,9 @@ role `query`) were taken at another time: their recall is what users see.
 
 Word weights change the ranking: a place model is valid only for rankings by the weights that it
 was fitted with.
+
+Where the photos have local features, a second place model is fitted on some of the photos with
+their matches. It is used if it answers more at the same share of right answers (`_helps`).
 """
 
 from __future__ import annotations
@@ -30,20 +33,26 @@ from services.steward.evaluation_search import (
 )
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
-from shared.catalog.maps import Map
+from shared.catalog.maps import Map, Matching
 from shared.catalog.photos import PhotoRole
 from shared.evaluation.places.evidence import (
     EVIDENCE_DEPTH,
     RankedPhoto,
+    are_matched,
     distance_between_m,
     estimate_location,
     is_same_place,
 )
-from shared.evaluation.places.figures import evaluate_places
-from shared.evaluation.places.fit import PlaceSample
+from shared.evaluation.places.figures import PlaceEvaluation, evaluate_places
+from shared.evaluation.places.fit import MIN_OWN_PHOTOS, PlaceSample
 from shared.evaluation.places.levels import LevelScheme, candidate_levels
 from shared.evaluation.places.probability import PlaceModel
-from shared.evaluation.places.samples import SAME_SESSION_PERIOD, IndexRanking, OwnPhotoSampler
+from shared.evaluation.places.samples import (
+    SAME_SESSION_PERIOD,
+    IndexRanking,
+    OwnPhotoSampler,
+    attach_matches,
+)
 from shared.search_api.protocol import SearchBackend, SearchHit
 
 RECALL_RANKS = (1, 5, 10)
@@ -108,6 +117,8 @@ class QueryOutcome:
     """Taken within SAME_SESSION_PERIOD of the photo that it matched: not used for the fit."""
     sample: PlaceSample | None
     """its levels; None if no photo with a place was found"""
+    matched_sample: PlaceSample | None
+    """the same with features of matches; None if the first photos could not all be matched"""
 
 
 @dataclass(slots=True)
@@ -142,6 +153,10 @@ def ratio(part: int, total: int) -> float | None:
     return part / total if total else None
 
 
+MAX_MATCHED_SAMPLE = 500  # photos whose matches are computed: about a minute on one core
+MIN_PHOTOS_TO_DECIDE = 100  # with fewer, it stays open whether matches help
+MIN_ANSWERED_GAIN = 0.03  # of the share of answered queries
+DECISIVE_CERTAINTY = 0.95
 MAX_RANKS = 800  # depth of the search for other places where hundreds of photos show the same one
 
 
@@ -151,14 +166,43 @@ class MapEvaluationResult:
 
     figures: dict[str, Any]
     model: PlaceModel
+    uses_matches: bool | None
+    """Whether matches help the map; None if too few photos could be matched."""
+
+
+@dataclass(frozen=True, slots=True)
+class _MatchEvaluation:
+    """A place model with matches, and whether it is better than the one without."""
+
+    places: PlaceEvaluation
+    is_used: bool
+
+
+def _helps(without: PlaceEvaluation, with_matches: PlaceEvaluation) -> bool:
+    """Return whether matches raise the answered share by MIN_ANSWERED_GAIN, and lower none.
+
+    The share of right answers is the same: the thresholds of both models are chosen for it.
+    """
+    gains = [
+        _answered(with_matches, share) - _answered(without, share)
+        for share in ("answered", "answered_at_finest_level")
+    ]
+    return max(gains) >= MIN_ANSWERED_GAIN and min(gains) >= 0
+
+
+def _answered(places: PlaceEvaluation, share: str) -> float:
+    assert places.figures is not None
+    at = next(a for a in places.figures["answers"] if a["certainty"] == DECISIVE_CERTAINTY)
+    answered: float = at[share]["mean"]
+    return answered
 
 
 class MapEvaluation:
     """Evaluates one generation of a map.
 
-    Photos within `radius_m` metres show the same place; `scheme` has the levels of an estimate.
-    `on_query` is called after every search; an exception that it raises
-    ends the evaluation.
+    Photos within `radius_m` metres show the same place; `scheme` has the levels of an estimate, and
+    `matching` tells whether matches are evaluated. `on_query` is called after every search and
+    every matched photo; an exception that it raises ends the evaluation.
     """
 
     def __init__(
@@ -168,8 +212,10 @@ class MapEvaluation:
         generation: Generation,
         radius_m: float,
         scheme: LevelScheme,
+        matching: Matching,
         on_query: Callable[[], None],
     ) -> None:
+        self.matching = matching
         self.radius_m = radius_m
         self.scheme = scheme
         self.on_query = on_query
@@ -210,19 +256,65 @@ class MapEvaluation:
         indices = [self._index_of[photo.photo_id] for photo in sample]
         spread = own_photos.spread(indices)
         labelled = self._evaluate_labelled_queries(rank_photo, own_photos, spread)
+        samples = list(own_photos.samples(indices, spread))
+        to_fit = [o for o in labelled.outcomes if not o.same_session]
         places = evaluate_places(
-            list(own_photos.samples(indices, spread)),
-            [o.sample for o in labelled.outcomes if o.sample and not o.same_session],
-            self.scheme,
-            spread,
+            samples, [o.sample for o in to_fit if o.sample], self.scheme, spread
         )
+        model, with_matches = places.model, None
+        if self.matching != Matching.OFF:
+            with_matches = self._evaluate_matches(own_photos, samples, to_fit, spread)
+        if with_matches is not None and with_matches.is_used:
+            model = model.model_copy(update={"with_matches": with_matches.places.model})
         figures = {
             "radius_m": self.radius_m,
             **recalls,
             "labelled_queries": labelled.figures(places.model) if self.queries else None,
             "places": places.figures,
+            "places_with_matches": with_matches and with_matches.places.figures,
+            "uses_matches": with_matches and with_matches.is_used,
         }
-        return MapEvaluationResult(figures, places.model)
+        return MapEvaluationResult(figures, model, with_matches and with_matches.is_used)
+
+    def matched_photos(self, sample: Sequence[GeotaggedPhoto]) -> int:
+        """Return how many photos of a sample are matched with others."""
+        return 0 if self.matching == Matching.OFF else min(len(sample), MAX_MATCHED_SAMPLE)
+
+    def _evaluate_matches(
+        self,
+        own_photos: OwnPhotoSampler,
+        samples: Sequence[PlaceSample],
+        labelled: Sequence[QueryOutcome],
+        spread: float,
+    ) -> _MatchEvaluation | None:
+        """Fit a place model with matches, and one without on the same photos to compare it with.
+
+        Returns:
+            None if too few photos can be matched with those that they find.
+        """
+        chosen = sorted({sample.photo for sample in samples})
+        if len(chosen) > MAX_MATCHED_SAMPLE:
+            rng = np.random.default_rng(len(chosen))
+            chosen = sorted(rng.choice(chosen, MAX_MATCHED_SAMPLE, replace=False).tolist())
+        matched: list[PlaceSample] = []
+        for photo in chosen:
+            matched += own_photos.samples([photo], spread, self._match_own_photo)
+            self.on_query()
+        photos = {sample.photo for sample in matched}
+        if len(photos) < MIN_OWN_PHOTOS:
+            return None
+        plain = [sample for sample in samples if sample.photo in photos]
+        both = [(o.sample, o.matched_sample) for o in labelled if o.sample and o.matched_sample]
+        without = evaluate_places(plain, [each for each, _ in both], self.scheme, spread)
+        places = evaluate_places(matched, [each for _, each in both], self.scheme, spread)
+        is_used = self.matching == Matching.ON or _helps(without, places)
+        if not is_used and len(photos) < MIN_PHOTOS_TO_DECIDE:
+            return None
+        return _MatchEvaluation(places, is_used)
+
+    def _match_own_photo(self, photo: int, others: Sequence[Any]) -> Sequence[float | None]:
+        photos = self.database.photos
+        return self.search.match(photos[photo].photo_id, [photos[o].photo_id for o in others])
 
     def _leave_one_out(
         self, sample: Sequence[GeotaggedPhoto], own_photos: OwnPhotoSampler
@@ -276,6 +368,9 @@ class MapEvaluation:
             neighbours = own_photos.neighbours(best) if best is not None else []
             levels = candidate_levels(ranked, neighbours, self.scheme, spread, self.radius_m)
             right = [level.is_right(query.spot) for level in levels]
+            matched = None
+            if levels and self.matching != Matching.OFF and number < MAX_MATCHED_SAMPLE:
+                matched = self._match_query(query, number, ranked, neighbours, spread)
             estimate = estimate_location(ranked, self.radius_m) if levels else UNKNOWN_LOCATION
             labelled.outcomes.append(
                 QueryOutcome(
@@ -284,9 +379,29 @@ class MapEvaluation:
                     error_m=distance_between_m(query.spot, estimate),
                     same_session=bool(ranking) and self._same_session(query, ranking[0][0]),
                     sample=PlaceSample(number, levels, right) if levels else None,
+                    matched_sample=matched,
                 )
             )
         return labelled
+
+    def _match_query(
+        self,
+        query: GeotaggedPhoto,
+        number: int,
+        ranked: Sequence[RankedPhoto],
+        neighbours: Sequence[RankedPhoto],
+        spread: float,
+    ) -> PlaceSample | None:
+        photos = self.database.photos
+
+        def match(others: Sequence[Any]) -> Sequence[float | None]:
+            return self.search.match(query.photo_id, [photos[o].photo_id for o in others])
+
+        ranked = attach_matches([r for r in ranked if r.photo is not None], match)
+        if not are_matched(ranked):
+            return None
+        levels = candidate_levels(ranked, neighbours, self.scheme, spread, self.radius_m)
+        return PlaceSample(number, levels, [level.is_right(query.spot) for level in levels])
 
     def _same_session(self, query: GeotaggedPhoto, best: SearchHit) -> bool:
         match = self._by_id.get(best.photo_id)

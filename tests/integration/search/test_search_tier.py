@@ -22,6 +22,7 @@ from services.steward.map_evaluation import MapEvaluation
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
+from shared.catalog.maps import Matching
 from shared.catalog.photos import Photo
 from shared.config.settings import Settings
 from shared.errors import Unavailable
@@ -331,7 +332,9 @@ def test_a_map_is_not_measured_while_a_shard_is_missing(
         session.get_one(Photo, next(iter(places.rows))).place = "hall"
         generation = session.get_one(Generation, places.generation_id)
     scheme = LevelScheme(labels_are_paths=False, radii_m=(25.0,))
-    measure = MapEvaluation(catalog, tier.port, generation, 25.0, scheme, lambda: None)
+    measure = MapEvaluation(
+        catalog, tier.port, generation, 25.0, scheme, Matching.OFF, lambda: None
+    )
     sample = measure.draw_sample(1, 0)
     measure.evaluate(sample)
     tier.servers[1][0].stop()

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from shared.evaluation.places.evidence import PhotoLocation, RankedPhoto
-from shared.evaluation.places.figures import evaluate_places
+from shared.evaluation.places.figures import PlaceEvaluation, evaluate_places
 from shared.evaluation.places.fit import (
     MIN_LABELLED_QUERIES,
     PlaceSample,
@@ -15,6 +19,7 @@ from shared.evaluation.places.fit import (
 )
 from shared.evaluation.places.levels import (
     FEATURES,
+    MATCH_FEATURES,
     CandidateLevel,
     LevelScheme,
     candidate_levels,
@@ -428,3 +433,59 @@ def test_labelled_queries_refine_the_model() -> None:
     assert abs(np.mean(refined) - 0.5) < abs(np.mean(sure) - 0.5)
     too_few = fit_place_model(samples, wrong[: MIN_LABELLED_QUERIES - 1], PATHS, 0.5)
     assert too_few.model == before
+
+
+# --- matches of local features -----------------------------------------------------------------
+
+
+def true_support(photo: int, others: Sequence[Any], *, per_place: int = 5) -> list[float]:
+    """Many matches between photos of one place, and few between others."""
+    return [80.0 if photo // per_place == other // per_place else 4.0 for other in others]
+
+
+def answered(evaluation: PlaceEvaluation) -> float:
+    assert evaluation.figures is not None
+    (at_95,) = (a for a in evaluation.figures["answers"] if a["certainty"] == 0.95)
+    share: float = at_95["answered_at_finest_level"]["mean"]
+    return share
+
+
+def test_matches_answer_what_similar_descriptors_leave_open() -> None:
+    own = sampler(places=40, per_place=5, noise=1.2)
+    photos = range(200)
+    spread = own.spread(photos)
+    plain = evaluate_places(list(own.samples(photos, spread)), [], PATHS, spread)
+    samples = list(own.samples(photos, spread, true_support))
+    assert len(samples[0].levels[0].features) == len(FEATURES) + len(MATCH_FEATURES)
+    matched = evaluate_places(samples, [], PATHS, spread)
+    assert answered(matched) > answered(plain) + 0.3
+    assert matched.figures is not None
+    assert matched.figures["answers"][2]["precision"]["mean"] >= 0.95
+
+
+def test_samples_whose_first_photos_were_not_all_compared_have_no_matches() -> None:
+    own = sampler(places=5, per_place=5, noise=1.0)
+
+    def without_the_last(photo: int, others: Sequence[Any]) -> list[float | None]:
+        return [*true_support(photo, others)[:-1], None]
+
+    assert list(own.samples(range(25), 0.5, without_the_last)) == []
+
+
+def test_matches_choose_the_place_but_only_if_the_map_is_fitted_for_them() -> None:
+    first, other = label("house/1/hall"), label("house/2/lobby")
+    ranking = [RankedPhoto(0.9 - n / 100, first if n % 2 == 0 else other, n) for n in range(10)]
+    compared = [
+        replace(r, support=90.0 if r.location == other else 2.0, score=r.score) for r in ranking
+    ]
+    plain = PlaceModel(source="own_photos", scheme=PATHS, spread=0.1)
+    matching = plain.model_copy(update={"with_matches": plain})
+    partly = [replace(compared[0], support=None), *compared[1:]]
+    for model, ranked, expected in (
+        (matching, compared, other),
+        (plain, compared, first),
+        (matching, partly, first),
+    ):
+        estimate = model.estimate(ranked, [], PATHS, 0.95, 25.0)
+        assert estimate is not None
+        assert (estimate.levels[0].place, estimate.location) == (expected.place, expected)
