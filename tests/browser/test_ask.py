@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import re
 from pathlib import Path
 from typing import Any
 
@@ -354,19 +355,37 @@ def test_a_file_that_is_no_photo_is_rejected_with_the_reason(visitor: Visitor) -
     expect(page.locator(".refused")).to_contain_text("JPEG")
 
 
-def test_a_match_is_shown_beside_the_photo_with_its_explanation(
+def test_a_match_is_shown_beside_the_photo_with_lines_between_their_points(
     visitor: Visitor, town: Town
 ) -> None:
     page = ask(visitor, town.queries[0])
-    page.locator(".match").first.click()
+    match = page.locator(".match").first
+    expect(match.locator(".match-points")).to_have_text(re.compile(r"^\d+ matching points?$"))
+    points = int(match.locator(".match-points").inner_text().split()[0])
+    assert f"{points} matching point" in (match.get_attribute("aria-label") or "")
+    match.click()
     dialog = page.get_by_role("dialog")
     expect(dialog.locator(".frame")).to_have_count(2)
-    overlay = dialog.locator(".overlay")
-    expect(overlay).to_be_visible()
-    assert (overlay.get_attribute("src") or "").startswith("data:image/png;base64,")
+    caption = f"{points} points of both photos match."
+    expect(dialog.get_by_role("status")).to_have_text(caption)
+    expect(dialog.get_by_role("img", name=caption)).to_be_visible()
+    lines = dialog.locator(".lines line")
+    expect(lines).to_have_count(min(points, 150))
+    left, right = (dialog.locator(".frame img").nth(side).bounding_box() for side in (0, 1))
+    assert left
+    assert right
+    for line in lines.all():
+        ends = line.evaluate(
+            """(line) => { const box = line.ownerSVGElement.getBoundingClientRect();
+            return ["1", "2"].map((end) => ["x", "y"].map((axis) =>
+              line[axis + end].baseVal.value + box[axis])); }"""
+        )
+        for (x, y), photo in zip(ends, (left, right), strict=True):
+            assert photo["x"] - 1 <= x <= photo["x"] + photo["width"] + 1
+            assert photo["y"] - 1 <= y <= photo["y"] + photo["height"] + 1
     page.keyboard.press("ArrowRight")
     expect(dialog.get_by_role("heading")).to_have_text("Match 2 of 12")
-    expect(overlay).to_be_visible()
+    expect(dialog.get_by_role("status")).to_contain_text("points of both photos match")
     page.keyboard.press("Escape")
     expect(dialog).to_have_count(0)
 

@@ -29,7 +29,7 @@ def open_view(visitor: Visitor, town: Town, view: str) -> Page:
         expect(page.locator(".number-pin").first).to_be_visible()
         if view == "compare":
             page.locator(".match").first.click()
-            expect(page.locator(".overlay")).to_be_visible()
+            expect(page.locator(".points")).to_be_visible()
     else:
         page = visitor.visit(view)
         if view == "photos":

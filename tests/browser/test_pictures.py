@@ -65,7 +65,7 @@ def test_pictures_are_taken(visitor: Visitor, town: Town, pictures: Path) -> Non
     visitor.page.set_viewport_size({"width": 1280, "height": 860})
     visitor.page.emulate_media(color_scheme="light")
     page.locator(".match").first.click()
-    expect(page.locator(".overlay")).to_be_visible()
+    expect(page.locator(".points")).to_be_visible()
     take(page, pictures / "compare.jpg")
     page.keyboard.press("Escape")
     page = visitor.visit("photos")

@@ -3,7 +3,7 @@
 import { Problem, ask, currentMap, get, idempotencyKey } from "../api.js";
 import { announce, bar, button, fill, h, noteError } from "../dom.js";
 import { takesDrops, takesPastes } from "../drop.js";
-import { nameOf, percent, plural, score, strength, whereabouts } from "../format.js";
+import { count, nameOf, percent, plural, score, strength, whereabouts } from "../format.js";
 import { stateInWords, watchJob } from "../jobs.js";
 import { localPicture, mayNeedPreview, preview, thumbnail } from "../photo.js";
 import { shrinkPhoto } from "../shrink.js";
@@ -101,8 +101,7 @@ export async function findSimilar(path, query, file, onjob, signal, ondescribed 
     headers: { ...(ondescribed ? {} : { Prefer: `wait=${WAIT_SECONDS}` }), "Idempotency-Key": idempotencyKey() },
     signal,
   });
-  // 202: its job first; of a photo that is then compared, a second one.
-  while (response.status === 202) {
+  if (response.status === 202) {
     const started = await response.json();
     const ended = await watchJob(started.job_id, onjob, signal);
     if (ended.state !== "succeeded") throw new Problem(422, ended.error ?? { detail: "The photo could not be described." }, null);
@@ -121,7 +120,8 @@ async function showAnswer(answer, queryPhoto, signal) {
   answer.scrollIntoView({ block: "start" });
   let found;
   try {
-    found = await queryPhoto.find({ top_k: TOP_K }, (job) => fill(progress, `The photo is ${stateInWords(job)}.`));
+    const { matching } = await readMap(signal);
+    found = await queryPhoto.find({ top_k: TOP_K, matches: TOP_K, explain: matching !== "off" }, (job) => fill(progress, `The photo is ${stateInWords(job)}.`));
   } catch (error) {
     if (signal.aborted) throw error;
     if (mine !== questions) return;
@@ -132,7 +132,7 @@ async function showAnswer(answer, queryPhoto, signal) {
   const photos = byProbability(found.similar_images);
   const { openMap } = await import("../map.js");
   const { compare } = await import("./compare.js");
-  const open = (index) => compare(queryPhoto, photos, index, signal);
+  const open = (index) => compare(queryPhoto, found, photos, index, signal);
   const located = photos.some((photo) => photo.latitude !== null);
   const ground = h("div", { class: "ground" });
   // Without levels, an estimate has no probabilities.
@@ -197,13 +197,15 @@ function matchCard(photo, index, onclick) {
   const word = strength(photo.match_probability);
   const where = photo.place && photo.latitude === null ? name : whereabouts({ ...photo, place: null });
   const likely = word ? `, ${word} match, ${percent(photo.match_probability)} the same place` : "";
-  return h("button", { type: "button", class: "match", onclick, "aria-label": `Match ${index + 1}${likely}: ${name}` },
+  const points = photo.inliers === null ? null : plural(photo.inliers, "matching point");
+  return h("button", { type: "button", class: "match", onclick, "aria-label": `Match ${index + 1}${likely}${points ? `, ${points}` : ""}: ${name}` },
     thumbnail(photo, ""),
     h("span", { class: "rank", "aria-hidden": "true" }, String(index + 1)),
     word && h("span", { class: "match-words" },
       h("span", { class: `strength ${word}` }, word),
       h("span", { class: "figure", title: "Probability that it shows the same place" }, percent(photo.match_probability))),
     h("span", { class: "match-name", title: name }, photo.place ?? name),
+    points && h("span", { class: "soft match-points" }, points),
     h("span", { class: "soft match-where" }, where));
 }
 
@@ -213,9 +215,11 @@ function figures(photos, weighted) {
   const order = likely
     ? `Photos are in the order of the probability that they show the same place. It is computed from all similarities${weighted ? ", with word weights" : ""}. A match is strong from 80 %, fair from 30 %, and weak below. Photos without coordinates or a label keep their place in the order of similarity.`
     : "Photos are in the order of their similarity.";
-  const heads = ["", "Photo", ...(likely ? ["Same place"] : []), ...(weighted ? ["Weighted score"] : []), "Similarity"];
+  const matched = photos.some((photo) => photo.inliers !== null);
+  const heads = ["", "Photo", ...(likely ? ["Same place"] : []), ...(weighted ? ["Weighted score"] : []), "Similarity", ...(matched ? ["Matching points"] : [])];
   const numbers = (photo) => [
     ...(likely ? [percent(photo.match_probability)] : []), ...(weighted ? [score(photo.weighted_score)] : []), score(photo.similarity_score),
+    ...(matched ? [photo.inliers === null ? "–" : count(photo.inliers)] : []),
   ];
   return h("details", { class: "card figures" }, h("summary", {}, "Details"),
     h("p", { class: "soft" }, `${order} Similarity is the cosine of two descriptors.`),

@@ -1,60 +1,74 @@
-// Two photos side by side, and what makes them similar.
+// Two photos side by side, with lines between the points that both show.
 
-import { Problem } from "../api.js";
 import { fill, h, openDialog } from "../dom.js";
-import { nameOf, percent, score, strength, whereabouts } from "../format.js";
+import { nameOf, percent, plural, score, strength, whereabouts } from "../format.js";
 import { preview } from "../photo.js";
 import { coordinateTools } from "../places.js";
 
+const SVG = "http://www.w3.org/2000/svg";
+const MAX_LINES = 150; // of the most similar points; more hide the photos
+
 /** Open the dialog at one of the matches; the arrow keys lead to the others. */
-export function compare(queryPhoto, photos, index, signal) {
+export function compare(queryPhoto, { matches }, photos, index, signal) {
   const body = h("div", { class: "compare" });
   const { dialog, heading } = openDialog("", body);
   dialog.classList.add("wide");
   signal.addEventListener("abort", () => dialog.close());
-  let shown = 0;
+  let redraw = () => {};
+  const resized = new ResizeObserver(() => redraw());
+  dialog.addEventListener("close", () => resized.disconnect());
 
-  async function show(next) {
+  function show(next) {
     index = (next + photos.length) % photos.length;
-    const mine = ++shown;
     const photo = photos[index];
+    const points = pointsInWords(photo, matches);
     fill(heading, `Match ${index + 1} of ${photos.length}`);
-    const overlay = h("img", { class: "overlay", alt: "", hidden: true });
-    const opacity = h("input", { type: "range", min: 0, max: 100, value: 70, "aria-label": "Strength of the overlay" });
-    opacity.addEventListener("input", () => (overlay.style.opacity = opacity.value / 100));
-    overlay.style.opacity = 0.7;
-    const why = h("div", { class: "why" }, h("p", { class: "soft" }, "Looking for what makes them similar…"));
+    const frames = [h("div", { class: "frame" }, queryPhoto.picture()), h("div", { class: "frame" }, preview(photo))];
+    const lines = document.createElementNS(SVG, "svg");
+    lines.classList.add("lines");
+    lines.setAttribute("role", "img");
+    lines.setAttribute("aria-label", points);
     fill(body,
-      h("figure", {}, h("div", { class: "frame" }, queryPhoto.picture(), overlay), h("figcaption", {}, queryPhoto.name)),
-      h("figure", {}, h("div", { class: "frame" }, preview(photo)), h("figcaption", {}, h("a", { href: `#/photo/${photo.image_id}` }, nameOf(photo)), h("span", { class: "soft" }, ` ${whereabouts(photo)}`)),
+      h("figure", {}, frames[0], h("figcaption", {}, queryPhoto.name)),
+      h("figure", {}, frames[1], h("figcaption", {}, h("a", { href: `#/photo/${photo.image_id}` }, nameOf(photo)), h("span", { class: "soft" }, ` ${whereabouts(photo)}`)),
         photo.latitude !== null && coordinateTools(photo.latitude, photo.longitude)),
+      photo.pairs?.length && lines,
       h("div", { class: "compare-words" },
         h("div", {},
           photo.match_probability !== null && h("p", {}, h("span", { class: `strength ${strength(photo.match_probability)}` }, strength(photo.match_probability)), h("span", { class: "figure large" }, ` ${percent(photo.match_probability)}`), h("span", { class: "soft" }, " the same place")),
           h("details", {}, h("summary", {}, "Details"), h("p", { class: "soft" }, `Similarity ${score(photo.similarity_score)} (cosine)`, photo.weighted_score !== null && `, weighted score ${score(photo.weighted_score)}`))),
-        why,
+        h("p", { class: "points", role: "status" }, points),
         h("div", { class: "row end" },
           h("button", { type: "button", onclick: () => show(index - 1) }, "← Previous"),
           h("button", { type: "button", onclick: () => show(index + 1) }, "Next →"))));
-    try {
-      const found = await queryPhoto.find({ top_k: 1, ids: photo.image_id, explain: true, history: false }, () => {});
-      const explanation = found.similar_images[0]?.explanation;
-      if (mine !== shown || !explanation) return;
-      overlay.src = explanation.overlay;
-      overlay.hidden = false;
-      fill(why,
-        h("p", { class: "legend" }, h("span", { class: "swatch for" }), "increases the similarity ", h("span", { class: "swatch against" }), "decreases it"),
-        h("label", { class: "field inline" }, h("span", {}, "Overlay"), opacity));
-    } catch (error) {
-      if (mine !== shown || signal.aborted) return;
-      fill(why, h("p", { class: "soft" }, error instanceof Problem ? error.message : "The explanation is not available now."));
-    }
+    redraw = () => photo.pairs?.length && drawLines(lines, frames, photo, matches);
+    resized.disconnect();
+    frames.forEach((frame) => resized.observe(frame)); // their heights are known when the photos are loaded
   }
 
   dialog.addEventListener("keydown", (event) => {
-    if (event.target instanceof HTMLInputElement) return;
     if (event.key === "ArrowLeft") show(index - 1);
     if (event.key === "ArrowRight") show(index + 1);
   });
   show(index);
+}
+
+function pointsInWords(photo, matches) {
+  if (photo.inliers !== null) return `${plural(photo.inliers, "point")} of both photos match.`;
+  return matches?.reason ? `No points can be compared. ${matches.reason}` : "This photo has no points to compare.";
+}
+
+/** Lines over both frames; the pairs are in pixels of the originals. */
+function drawLines(svg, frames, photo, matches) {
+  const origin = svg.getBoundingClientRect();
+  const [query, other] = frames.map((frame) => frame.firstChild.getBoundingClientRect());
+  const place = ([x, y], area, width, height) => [area.left - origin.left + (x / width) * area.width, area.top - origin.top + (y / height) * area.height];
+  const shown = photo.pairs.slice(0, MAX_LINES);
+  svg.replaceChildren(...shown.map((pair, number) => {
+    const [x1, y1] = place(pair.query, query, matches.query_width, matches.query_height);
+    const [x2, y2] = place(pair.photo, other, photo.width, photo.height);
+    const line = document.createElementNS(SVG, "line");
+    Object.entries({ x1, y1, x2, y2, stroke: `hsl(${(360 * number) / shown.length} 90% 55%)` }).forEach(([name, value]) => line.setAttribute(name, value));
+    return line;
+  }));
 }
