@@ -1,22 +1,17 @@
-"""`placewise storage backup`, `restore` and `rebuild`, on catalog and object store directly.
+"""`placewise storage backup`, `restore` and `rebuild`.
 
 A backup is a copy of the object store, and a restore ends with a rebuild of the catalog from it.
-The rebuild is imported where it is used: it reads photos, whose libraries not every image contains.
+`maintenance` does the work; it is imported when a command runs.
 """
 
 from __future__ import annotations
 
-import contextlib
-import os
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
-from uuid import UUID
 
 import typer
 from rich.markup import escape
-from sqlalchemy.exc import SQLAlchemyError
 
 from services.cli.environment import read_settings
 from services.cli.output import (
@@ -28,68 +23,11 @@ from services.cli.output import (
     progress_bar,
     stage_bars,
 )
-from services.cli.recovery.backup import BackupFolder, create_backup
-from shared.catalog.database.errors import explain_outage
-from shared.catalog.database.schema import check_schema, migrate, opening
-from shared.catalog.database.session import NO_TIMEOUTS, Catalog
-from shared.catalog.installation import get_or_create_installation, open_installation_store
-from shared.catalog.tables import open_catalog
-from shared.config.embedded_home import lock_home
-from shared.config.settings import Settings
-from shared.errors import Misconfigured
-from shared.storage import OwnedStore
-from shared.storage.open_store import open_store
-from shared.storage.ownership import read_owner
 
 if TYPE_CHECKING:
     from services.cli.recovery.journal_rows import RecoveryReport
 
 MAX_KEYS_SHOWN = 10
-
-
-@contextlib.contextmanager
-def open_storage(settings: Settings, command: str) -> Iterator[tuple[Catalog, OwnedStore]]:
-    """Open the catalog and the object store, whether or not services are running.
-
-    Args:
-        command: Name of the command, shown as the database connection's application name.
-
-    Raises:
-        Misconfigured: `nothing_stored` if PLACEWISE_HOME contains no catalog, and the errors of
-            `check_schema` and `open_installation_store`.
-        Unavailable: The database or the object store can't be reached.
-    """
-    if settings.database_url is None and not (settings.placewise_home / "catalog.sqlite").exists():
-        raise Misconfigured(
-            "nothing_stored",
-            f"No catalog found in {settings.placewise_home}. Set PLACEWISE_HOME to the folder of "
-            "the installation, or set DATABASE_URL.",
-        )
-    catalog = open_catalog(settings, command, NO_TIMEOUTS)
-    try:
-        with opening(catalog):
-            check_schema(catalog)
-        yield catalog, open_installation_store(catalog, settings, exclusive=False)
-    except SQLAlchemyError as error:
-        unavailable = explain_outage(error)
-        if unavailable is None:
-            raise
-        raise unavailable from error
-    finally:
-        catalog.close()
-
-
-@contextlib.contextmanager
-def _open_new_catalog(settings: Settings, command: str) -> Iterator[tuple[Catalog, OwnedStore]]:
-    """Open the catalog, with its tables created, and a store that may not be its own yet."""
-    exclusive = settings.database_url is None
-    with contextlib.ExitStack() as stack:
-        if exclusive:
-            stack.enter_context(lock_home(settings.placewise_home))
-        opened = open_catalog(settings, command, NO_TIMEOUTS)
-        catalog = stack.enter_context(contextlib.closing(opened))
-        migrate(catalog)
-        yield catalog, open_store(settings, exclusive=exclusive)
 
 
 def backup(
@@ -103,10 +41,10 @@ def backup(
     The exit code is 1 if an object that the catalog refers to is missing or damaged. The backup
     then contains everything else.
     """
-    with progress_bar() as bars, open_storage(read_settings(), "backup") as (catalog, store):
-        with catalog.write() as session:
-            installation_id = get_or_create_installation(session).id
-        manifest = create_backup(catalog, store, installation_id, out, stage_bars(bars))
+    with progress_bar() as bars:
+        from services.cli.operations.maintenance import back_up
+
+        manifest = back_up(read_settings(), out, stage_bars(bars))
     if as_json:
         print_json(asdict(manifest))
     else:
@@ -132,16 +70,10 @@ def restore(
 
     An interrupted restore resumes when the command is run again.
     """
-    from services.cli.recovery.restore import open_backup, restore_backup
+    with progress_bar() as bars:
+        from services.cli.operations import maintenance
 
-    settings, folder = read_settings(), BackupFolder(source)
-    open_backup(folder)  # before anything is created
-    with contextlib.ExitStack() as stack:
-        progress = stage_bars(stack.enter_context(progress_bar()))
-        if os.access(source, os.W_OK):  # a read-only folder has no concurrent writer
-            stack.enter_context(folder.lock())
-        catalog, store = stack.enter_context(_open_new_catalog(settings, "restore"))
-        restored = restore_backup(folder, catalog, store, settings, progress)
+        restored = maintenance.restore(read_settings(), source, stage_bars(bars))
     if as_json:
         print_json(asdict(restored))
         return
@@ -155,21 +87,16 @@ NOT_RECOVERED_NOTE = (
 )
 
 
-def rebuild(as_json: JsonOption = False) -> None:
+def rebuild_catalog(as_json: JsonOption = False) -> None:
     """Rebuild a lost catalog from the object store. Stop all services first.
 
     Recovers photos with their metadata, maps, generations, vocabularies, API keys and webhooks. An
     interrupted rebuild resumes when the command is run again.
     """
-    from services.cli.recovery.rebuild import begin_rebuild, rebuild_catalog
+    with progress_bar() as bars:
+        from services.cli.operations.maintenance import rebuild
 
-    settings = read_settings()
-    with progress_bar() as bars, _open_new_catalog(settings, "rebuild") as (catalog, store):
-        mark = read_owner(store)
-        begin_rebuild(catalog, store, UUID(mark) if mark else None)
-        recovered = rebuild_catalog(
-            catalog, store, settings, with_unnamed=True, progress=stage_bars(bars)
-        )
+        recovered = rebuild(read_settings(), stage_bars(bars))
     if as_json:
         print_json(asdict(recovered))
         return

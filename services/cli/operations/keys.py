@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Collection, Iterator, Sequence
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 from uuid import UUID
 
 import typer
 
-from placewise.answers import CreatedKey, Key
+from placewise.answers import Key
 from placewise.client import Client
 from services.cli.environment import read_settings
 from services.cli.output import (
@@ -26,22 +26,11 @@ from services.cli.output import (
     print_result,
     print_table,
 )
-from shared.catalog.api_keys import (
-    ApiKey,
-    KeyLimits,
-    create_api_key,
-    list_api_keys,
-    revoke_api_key,
-)
-from shared.catalog.database.schema import wait_for_schema
-from shared.catalog.database.session import Catalog
-from shared.catalog.maps import Map, list_maps
-from shared.catalog.tables import open_catalog
 from shared.errors import Conflict, NotFound
 from shared.security.api_keys import Scope
-from shared.telemetry.logs import configure_logging
 
-SECONDS_PER_DAY = 86_400.0
+if TYPE_CHECKING:
+    from services.cli.operations.catalog_keys import CatalogKeys
 
 app = typer.Typer(help="Manage API keys: their scopes, limits and expiry.")
 
@@ -143,60 +132,16 @@ def _check_maps(names: Sequence[str], existing: Collection[str]) -> None:
 
 
 @contextlib.contextmanager
-def _open_keys(server: str | None, key: str | None) -> Iterator[Client | _CatalogKeys]:
+def _open_keys(server: str | None, key: str | None) -> Iterator[Client | CatalogKeys]:
     """Connect to a server, or open the catalog if none is given."""
     if server:
         with Client(server, key=key) as client:
             yield client
         return
-    settings = read_settings()
-    configure_logging(settings, "keys", to_file=False)
-    with contextlib.closing(open_catalog(settings, "keys")) as catalog:
-        wait_for_schema(catalog, 0)
-        yield _CatalogKeys(catalog)
+    from services.cli.operations.catalog_keys import open_catalog_keys  # needs the database
 
-
-class _CatalogKeys:
-    """The calls of the client about keys, on the catalog itself."""
-
-    def __init__(self, catalog: Catalog) -> None:
-        self._catalog = catalog
-
-    def create_key(
-        self,
-        name: str,
-        scopes: Sequence[Scope],
-        days: float | None,
-        maps: list[str] | None,
-        **limits: int | None,
-    ) -> CreatedKey:
-        life_seconds = None if days is None else days * SECONDS_PER_DAY
-        with self._catalog.write() as session:
-            row, secret = create_api_key(
-                session,
-                name,
-                set(scopes),
-                life_seconds=life_seconds,
-                limits=KeyLimits(**limits),
-                maps=maps,
-            )
-            return CreatedKey(**_key_fields(row), key=secret)
-
-    def keys(self) -> list[Key]:
-        with self._catalog.read() as session:
-            return [Key(**_key_fields(row)) for row in list_api_keys(session)]
-
-    def maps(self) -> list[Map]:
-        with self._catalog.read() as session:
-            return list_maps(session)
-
-    def revoke_key(self, key_id: UUID) -> Key:
-        with self._catalog.write() as session:
-            return Key(**_key_fields(revoke_api_key(session, key_id)))
-
-
-def _key_fields(row: ApiKey) -> dict[str, Any]:
-    return {name: getattr(row, name) for name in Key.model_fields}
+    with open_catalog_keys(read_settings()) as keys:
+        yield keys
 
 
 def _resolve_key_id(id_or_prefix: str, keys: list[Key]) -> UUID:

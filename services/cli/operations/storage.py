@@ -6,17 +6,14 @@ the bucket, assign the store to a catalog, and manage orphaned objects and the t
 
 from __future__ import annotations
 
-import contextlib
-from collections import Counter
 from dataclasses import asdict
-from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
 
 from services.cli.environment import read_settings
-from services.cli.operations.backup import backup, open_storage, rebuild, restore
+from services.cli.operations.backup import backup, rebuild_catalog, restore
 from services.cli.output import (
     JsonOption,
     console,
@@ -27,38 +24,11 @@ from services.cli.output import (
     progress_bar,
     stage_bars,
 )
-from services.steward.tasks.orphans import StoreCount, collect_orphans, count_store, find_orphans
-from shared.catalog.database.schema import check_schema, migrate
-from shared.catalog.database.session import NO_TIMEOUTS, Catalog
-from shared.catalog.installation import adopt_store, check_not_behind, get_or_create_installation
-from shared.catalog.tables import open_catalog
-from shared.config.embedded_home import lock_home
-from shared.errors import Conflict, Misconfigured
-from shared.integrity.referenced_objects import plural
-from shared.integrity.verify import IntegrityReport, repair_descriptors, verify_store
-from shared.jobs import InProcessWakeups
-from shared.storage import OwnedStore
-from shared.storage.open_store import open_store
-from shared.storage.ownership import read_owner
-from shared.storage.trash import (
-    Hold,
-    HoldReason,
-    measure_trash,
-    read_hold,
-    restore_trash,
-    write_hold,
-)
-from shared.telemetry.logs import configure_logging
 
-app = typer.Typer(
-    help="Verify, back up, restore and rebuild what is stored; manage the bucket, its owner, "
-    "orphans and trash.",
-    no_args_is_help=True,
-)
+if TYPE_CHECKING:
+    from services.steward.tasks.orphans import StoreCount
+    from shared.integrity.verify import IntegrityReport
 
-ConfirmOption = Annotated[
-    bool, typer.Option("--confirm", help="Apply the change. Without it, the command only reports.")
-]
 MAX_FAULTS_SHOWN = 20
 REMEDIES = {
     "chunk": "placewise storage verify --repair queues their photos again",
@@ -73,7 +43,6 @@ REMEDIES = {
 }
 
 
-@app.command("verify")
 def verify(
     originals: Annotated[
         bool, typer.Option("--originals", help="Also check every original photo against its hash.")
@@ -92,17 +61,12 @@ def verify(
 
     The exit code is 1 if a fault is found, even if it is repaired.
     """
-    with progress_bar() as bars, open_storage(read_settings(), "verify") as (catalog, store):
-        progress = stage_bars(bars)
-        report = verify_store(catalog, store, originals=originals, progress=progress)
-        for info in find_orphans(catalog, store, age_seconds=0.0):
-            report.orphans += 1
-            report.orphan_bytes += info.size_bytes
-            progress("orphaned objects", report.orphans, report.orphans)
-        trash = measure_trash(store)
-        report.trash_objects, report.trash_bytes = trash.objects, trash.size_bytes
-        # No wakeup message is needed: workers poll, and the steward sends messages.
-        queued = repair_descriptors(catalog, InProcessWakeups(), report) if repair else None
+    from services.cli.operations.maintenance import verify_storage
+
+    with progress_bar() as bars:
+        report, queued = verify_storage(
+            read_settings(), stage_bars(bars), originals=originals, repair=repair
+        )
     if as_json:
         print_json(_report_as_json(report, queued))
     else:
@@ -129,6 +93,8 @@ def _report_as_json(report: IntegrityReport, queued: int | None) -> dict[str, An
 
 
 def _print_report(report: IntegrityReport, queued: int | None) -> None:
+    from shared.integrity.referenced_objects import plural
+
     checked = ", ".join(f"{count} {plural(kind)}" for kind, count in sorted(report.checked.items()))
     print_message(
         f"Checked {checked or 'nothing'} ({report.read_bytes / 1e6:.1f} MB): "
@@ -164,25 +130,34 @@ def _print_report(report: IntegrityReport, queued: int | None) -> None:
         print_note("Photos without their originals can't be described again.")
 
 
-app.command("backup")(backup)
-app.command("restore")(restore)
-app.command("rebuild")(rebuild)
+app = typer.Typer(
+    help="Verify, back up, restore and rebuild what is stored; manage the bucket, its owner, "
+    "orphans and trash.",
+    no_args_is_help=True,
+)
 
 
-@app.command("migrate")
-def migrate_catalog() -> None:
+def migrate() -> None:
     """Create the catalog's tables in an empty database (DATABASE_URL).
 
     Run it before the services start. It changes nothing where they exist, and refuses the tables of
     another version.
     """
-    settings = read_settings()
-    configure_logging(settings, "migrate", to_file=False)
-    with contextlib.closing(open_catalog(settings, "migrate")) as catalog:
-        migrate(catalog)
-        with catalog.write() as session:
-            installation_id = get_or_create_installation(session).id
+    from services.cli.operations.maintenance import migrate_catalog
+
+    installation_id = migrate_catalog(read_settings())
     print_note(f"The catalog has its tables (installation {installation_id})")
+
+
+app.command("verify")(verify)
+app.command("backup")(backup)
+app.command("restore")(restore)
+app.command("rebuild")(rebuild_catalog)
+app.command("migrate")(migrate)
+
+ConfirmOption = Annotated[
+    bool, typer.Option("--confirm", help="Apply the change. Without it, the command only reports.")
+]
 
 
 @app.command("create-bucket")
@@ -212,28 +187,9 @@ def adopt(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
     afterwards. Objects that are not in this catalog are kept until you run `placewise storage
     collect --confirm`.
     """
-    settings = read_settings()
-    with contextlib.ExitStack() as stack:
-        if settings.database_url is None:
-            stack.enter_context(lock_home(settings.placewise_home))
-        opened = open_catalog(settings, "storage", NO_TIMEOUTS)
-        catalog = stack.enter_context(contextlib.closing(opened))
-        store = open_store(settings, exclusive=False)
-        store.check()
-        if confirm and catalog.is_sqlite:
-            migrate(catalog)
-        is_new = catalog.is_sqlite and not Path(catalog.url.database or "").exists()
-        if not is_new:
-            check_schema(catalog)
-            _check_not_owned(catalog, store)
-        count = count_store(None if is_new else catalog, store)
-        unknown = count.orphans.total()
-        if confirm:
-            # The hold comes first: without it, this catalog's steward could collect the objects.
-            if unknown:
-                unknown_bytes = count.orphan_bytes.total()
-                write_hold(store, Hold(HoldReason.ADOPTED, unknown, unknown_bytes, count.objects))
-            adopt_store(catalog, store)
+    from services.cli.operations.maintenance import adopt_storage
+
+    count = adopt_storage(read_settings(), confirm=confirm)
     if as_json:
         print_json({"adopted": confirm, **_as_dict(count)})
         return
@@ -249,15 +205,6 @@ def adopt(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
         )
 
 
-def _check_not_owned(catalog: Catalog, store: OwnedStore) -> None:
-    with catalog.write() as session:
-        installation_id = get_or_create_installation(session).id
-    if read_owner(store) == str(installation_id):
-        with contextlib.suppress(Misconfigured):  # an older catalog may be made the owner
-            check_not_behind(catalog, store)
-            raise Conflict("already_owner", "This catalog already owns the store.")
-
-
 @app.command("collect")
 def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
     """Count orphaned objects by prefix; with --confirm, move them to the trash.
@@ -265,15 +212,10 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
     Orphans are objects older than ORPHAN_AGE_SECONDS that are not in the catalog. --confirm also
     overrides a hold on garbage collection. Services can keep running.
     """
+    from services.cli.operations.maintenance import collect_storage
+
     settings = read_settings()
-    with open_storage(settings, "storage") as (catalog, store):
-        count, moved, hold = StoreCount(), 0, read_hold(store)
-        for _ in find_orphans(catalog, store, settings.orphan_age_seconds, count):
-            pass
-        while confirm and (
-            batch := collect_orphans(catalog, store, settings.orphan_age_seconds, confirmed=True)
-        ):
-            moved += batch
+    count, moved, hold = collect_storage(settings, confirm=confirm)
     if as_json:
         hold_reason = None if hold is None else hold.reason
         print_json({"moved": moved, "held": hold_reason, **_as_dict(count)})
@@ -292,7 +234,7 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
 
 
 @app.command("restore-trash")
-def restore_from_trash(
+def restore_trash(
     prefix: Annotated[
         str,
         typer.Option(
@@ -306,8 +248,9 @@ def restore_from_trash(
     This does not add them to the catalog: they are orphans again and are kept for another
     ORPHAN_AGE_SECONDS. `placewise storage rebuild` creates a catalog from all objects.
     """
-    with open_storage(read_settings(), "storage") as (_, store):
-        counts = Counter(was_restored for _, was_restored in restore_trash(store, prefix))
+    from services.cli.operations.maintenance import restore_from_trash
+
+    counts = restore_from_trash(read_settings(), prefix)
     restored, skipped = counts[True], counts[False]
     if as_json:
         print_json({"restored": restored, "kept_in_trash": skipped})

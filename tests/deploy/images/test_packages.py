@@ -26,7 +26,7 @@ MODULES = {
 COMMAND = [
     "services.cli.main",
     "services.cli.operations.installation_checks",
-    "services.cli.operations.storage",
+    "services.cli.operations.maintenance",
     "shared.catalog.installation",
     "shared.telemetry.heartbeat",
     "alembic.command",
