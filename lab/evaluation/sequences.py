@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.datasets.ground_truth import parse_rule
+from lab.evaluation.array_photo_graph import ArrayPhotoGraph
 from lab.evaluation.confidence_metrics import recall_at_precision
 from lab.evaluation.seqslam import hmm_matches, seqslam_matches
 from shared.evaluation.calibration import expected_calibration_error
@@ -28,7 +29,7 @@ from shared.tracks.belief import Belief, TrackStatus
 from shared.tracks.evidence import HITS, FrameEvidence, frame_evidence
 from shared.tracks.filter import TrackFilter
 from shared.tracks.motion import MotionModel
-from shared.tracks.photo_graph import ArrayPhotoGraph, PhotoTable
+from shared.tracks.photo_graph import PhotoTable
 
 Rows = NDArray[np.float32]
 

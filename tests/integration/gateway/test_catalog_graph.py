@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from sqlalchemy import delete, insert
 
+from lab.evaluation.array_photo_graph import ArrayPhotoGraph
 from services.gateway.tracks import apply_frames, catalog_graph
 from services.gateway.tracks.catalog_graph import CatalogPhotoGraph
 from services.steward.tasks.maintenance import update_statistics_of_large_maps
@@ -23,7 +24,7 @@ from shared.tracks import filter as filter_module
 from shared.tracks.belief import Belief
 from shared.tracks.evidence import FrameEvidence, Hit, PositionFix
 from shared.tracks.filter import TrackFilter
-from shared.tracks.photo_graph import ArrayPhotoGraph, FloatArray, PhotoTable, distance_matrix_m
+from shared.tracks.photo_graph import FloatArray, PhotoTable, distance_matrix_m
 from tests.support.catalog_rows import add_job, add_map, add_photo, made_up_photo
 
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)

@@ -7,9 +7,10 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
+from lab.evaluation.array_photo_graph import ArrayPhotoGraph
 from shared.geodesy import EARTH_RADIUS_M
 from shared.tracks.evidence import FrameEvidence, Hit
-from shared.tracks.photo_graph import ArrayPhotoGraph, PhotoTable
+from shared.tracks.photo_graph import PhotoTable
 
 START = datetime(2026, 1, 1, tzinfo=UTC)
 

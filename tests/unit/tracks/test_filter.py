@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lab.evaluation.array_photo_graph import ArrayPhotoGraph
 from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
 from shared.geodesy import EARTH_RADIUS_M
@@ -28,7 +29,7 @@ from shared.tracks.filter import (
     TrackFilter,
 )
 from shared.tracks.motion import MOTION_MODELS, motion_model
-from shared.tracks.photo_graph import ArrayPhotoGraph, PhotoTable
+from shared.tracks.photo_graph import PhotoTable
 from shared.tracks.state import TrackState
 from tests.unit.tracks.maps import at, frame, line_map, pointing_at, sequence_map
 

@@ -7,10 +7,11 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 
+from lab.evaluation.array_photo_graph import ArrayPhotoGraph
 from shared.tracks import filter as filter_module
 from shared.tracks.evidence import FrameEvidence, frame_evidence
 from shared.tracks.filter import TrackFilter
-from shared.tracks.photo_graph import ArrayPhotoGraph, PhotoTable
+from shared.tracks.photo_graph import PhotoTable
 
 pytestmark = pytest.mark.numerics
 
