@@ -25,9 +25,9 @@ from torchvision.transforms import functional
 from lab.datasets.dataset import EvaluationSet, TrainingPlace, TrainingSet
 from lab.datasets.open_dataset import evaluation_set_names, open_evaluation_set, open_training_set
 from lab.training.arguments import TrainingArguments, data_root_error, suggest_name
+from lab.training.photo_decoding import decode_resized
 from shared.errors import NotFound, Unprocessable
 from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
-from shared.imaging.decode import decode_resized
 
 ORDER_STREAM, PHOTO_STREAM, AUGMENT_STREAM = 1, 2, 3  # keep the random streams independent
 

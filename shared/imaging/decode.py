@@ -3,11 +3,6 @@
 `decode_photo` runs in child processes with a memory limit (`services.extractor.decoder_pool`), so
 that a malicious photo only fails its own job.
 
-`decode_resized` is the fast path of training, where thousands of photos a minute are decoded to a
-small size: it decodes a JPEG at the smallest eighth that still covers the requested size
-(`Image.draft`), which costs a fraction and differs from a full decode by less than one
-augmentation does.
-
 Imports no torch.
 """
 
@@ -16,7 +11,6 @@ from __future__ import annotations
 import io
 import warnings
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,9 +98,9 @@ def decode_photo(
                     # None keeps the mode; other formats than JPEG ignore the call.
                     image.draft(None, (image.width // 2, image.height // 2))
                 image.load()
-                as_stored = _to_rgb(image)
-                upright = _apply_exif_orientation(image, as_stored)
-                if _is_sideways(image):
+                as_stored = to_rgb(image)
+                upright = apply_exif_orientation(image, as_stored)
+                if is_sideways(image):
                     size = size[::-1]
             pixels = preprocessing.apply(upright if preprocessing.upright else as_stored)
             thumbnail = _small_jpeg(upright, THUMBNAIL_PIXELS, quality=85)
@@ -150,7 +144,7 @@ def _open_image(data: bytes, media_type: str | None) -> Image.Image:
     return Image.open(io.BytesIO(data), formats=("HEIF",))
 
 
-def _apply_exif_orientation(image: Image.Image, rgb: Image.Image) -> Image.Image:
+def apply_exif_orientation(image: Image.Image, rgb: Image.Image) -> Image.Image:
     """Transpose `rgb` by the EXIF orientation of `image`.
 
     Pillow's `exif_transpose` also rewrites the EXIF, and fails if any other tag is broken.
@@ -163,7 +157,15 @@ def _apply_exif_orientation(image: Image.Image, rgb: Image.Image) -> Image.Image
     return rgb if method is None else rgb.transpose(method)
 
 
-def _to_rgb(image: Image.Image) -> Image.Image:
+def is_sideways(image: Image.Image) -> bool:
+    """Whether the EXIF orientation of an image exchanges width and height."""
+    try:
+        return image.getexif().get(Base.Orientation) in ROTATED_ORIENTATIONS
+    except PHOTO_READ_ERRORS:
+        return False  # broken EXIF does not affect the pixels
+
+
+def to_rgb(image: Image.Image) -> Image.Image:
     """Convert to 8-bit RGB on black; ValueError for modes without a defined brightness range."""
     if image.mode.startswith("I;16"):
         # Pillow would clip 16-bit samples at 255 and make the photo white.
@@ -195,45 +197,3 @@ def _small_jpeg(rgb: Image.Image, longer_side: int, *, quality: int) -> bytes:
     buffer = io.BytesIO()
     small.save(buffer, "JPEG", quality=quality)
     return buffer.getvalue()
-
-
-MAX_TRAINING_PIXELS = 100_000_000
-
-
-def decode_resized(
-    path: Path,
-    size: tuple[int, int],
-    *,
-    resampling: Image.Resampling = Image.Resampling.BILINEAR,
-) -> Image.Image:
-    """Decode a photo to upright RGB of `size` (height, width), ignoring the aspect ratio.
-
-    The resize is antialiased.
-
-    Raises:
-        Unprocessable: `undecodable_photo`, `too_many_pixels`; the message has the reason but not
-            the path.
-    """
-    height, width = size
-    try:
-        with warnings.catch_warnings(), path.open("rb") as file:
-            warnings.simplefilter("ignore")  # about unusual tags, which do not affect the pixels
-            with open_photo(file) as image:
-                check_pixel_count(image.width, image.height, MAX_TRAINING_PIXELS)
-                image.draft("RGB", (height, width) if _is_sideways(image) else (width, height))
-                image.load()
-                upright = _apply_exif_orientation(image, _to_rgb(image))
-            return upright.resize((width, height), resampling)
-    except UnidentifiedImageError as error:
-        raise Unprocessable(
-            "undecodable_photo", f"it is not {ACCEPTED_PHOTOS}, or its header is damaged"
-        ) from error
-    except PHOTO_READ_ERRORS as error:
-        raise Unprocessable("undecodable_photo", f"{error or type(error).__name__}") from error
-
-
-def _is_sideways(image: Image.Image) -> bool:
-    try:
-        return image.getexif().get(Base.Orientation) in ROTATED_ORIENTATIONS
-    except PHOTO_READ_ERRORS:
-        return False  # broken EXIF does not affect the pixels

@@ -24,7 +24,7 @@ from lab.training.data import (
     load_batches,
     to_tensor,
 )
-from shared.imaging.decode import decode_resized
+from lab.training.photo_decoding import decode_resized
 from tests.lab.unit.data_sets import refused
 
 
