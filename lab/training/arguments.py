@@ -74,213 +74,167 @@ NameList = Annotated[tuple[str, ...], BeforeValidator(_parse_names)]
 IntList = Annotated[tuple[int, ...], BeforeValidator(_parse_integers)]
 HeightWidth = Annotated[tuple[int, int], BeforeValidator(_parse_image_size)]
 
-
-def _argument(group: str, default: Any, help_text: str, **limits: Any) -> Any:
-    return Field(default, description=help_text, json_schema_extra={"group": group}, **limits)
-
-
-DATA, MODEL, OPTIMISATION, LOSS = "Data", "Model", "Optimisation", "Loss and miner"
-EVALUATION, CHECKPOINTS, MACHINE, RUN = "Evaluation", "Checkpoints", "Machine", "Run"
+FIRST_OF_GROUP = {
+    "data_root": "Data",
+    "backbone_arch": "Model",
+    "lr": "Optimisation",
+    "loss_name": "Loss and miner",
+    "val_set_names": "Evaluation",
+    "experiment_phase": "Run",
+    "monitor": "Checkpoints",
+    "accelerator": "Machine",
+}
+"""Help panel of an argument and of those that follow it in `TrainingArguments`"""
 
 
 class TrainingArguments(BaseModel):
     """Validated arguments of one training run. Sizes in pixels are (height, width)."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, protected_namespaces=())
-
-    data_root: Path | None = _argument(
-        DATA, None, "Folder of the training set, in a layout that `placewise datasets check` knows."
-    )
-    eval_roots: Annotated[tuple[Path, ...], BeforeValidator(_parse_literal)] = _argument(
-        DATA, (), "JSON list of folders with the evaluation sets. Empty: data_root."
-    )
-    cities: NameList = _argument(
-        DATA, CITIES, "Cities to train on, in this order. If omitted: all cities in the folder."
-    )
-    batch_size: int = _argument(DATA, 64, "Number of places per batch.", ge=1)
-    img_per_place: int = _argument(DATA, 2, "Number of photos per place in a batch.", ge=1)
-    min_img_per_place: int = _argument(DATA, 2, "Skip places with fewer photos than this.", ge=1)
-    shuffle_all: bool = _argument(
-        DATA, False, "Shuffle places across cities. False: shuffle within each city, in turn."
-    )
-    random_sample_from_each_place: bool = _argument(
-        DATA, True, "Sample a place's photos at random. False: take its first photos."
-    )
-    image_size: HeightWidth = _argument(
-        DATA, (320, 320), "Height and width of training photos, in pixels."
-    )
-    interpolation: Literal["bilinear", "bicubic"] = _argument(
-        DATA, "bilinear", "Resizing of photos, which the trained model keeps: bilinear or bicubic."
-    )
-    num_workers: int = _argument(
-        DATA, 8, "Number of data loader processes. 0: load in the main process.", ge=0
-    )
-    show_data_stats: bool = _argument(DATA, True, "Print data set statistics before training.")
-    augmentation: Literal["randaugment", "none"] = _argument(
-        DATA, "randaugment", "Data augmentation of training photos: randaugment or none."
-    )
-    randaugment_magnitude: int = _argument(
-        DATA, 9, "Strength of randaugment's three operations, from 0 to 30.", ge=0, le=30
-    )
-    on_bad_image: Literal["skip", "error"] = _argument(
-        DATA, "skip", "Photos that cannot be decoded: skip (and report them) or error."
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, protected_namespaces=(), use_attribute_docstrings=True
     )
 
-    backbone_arch: str = _argument(
-        MODEL, "resnet18", "Name of the backbone, or package.module:function of your own."
-    )
-    pretrained: bool = _argument(MODEL, True, "Initialise the backbone with ImageNet weights.")
-    weights: Path | None = _argument(
-        MODEL,
-        None,
-        "File with the backbone's weights, or a checkpoint of the whole network to fine-tune. "
-        "If omitted: the torch.hub cache.",
-    )
-    layers_to_freeze: int = _argument(
-        MODEL, 2, "Freeze layers up to and including this one. -1: freeze none.", ge=-1
-    )
-    layers_to_crop: IntList = _argument(
-        MODEL, (), "JSON list of layers to remove: 4 removes layer4, 3 also removes layer3."
-    )
-    backbone_norm: bool = _argument(
-        MODEL, True, "Apply the final norm of DINOv2 and Swin. False for BoQ's published DINOv2."
-    )
-    agg_arch: str = _argument(
-        MODEL, "AVG", "Name of the aggregator, or package.module:Class of your own."
-    )
-    agg_config: Annotated[dict[str, Any], BeforeValidator(_parse_literal)] = _argument(
-        MODEL, {}, "JSON dict of aggregator arguments. Channels and map size are inferred."
-    )
+    data_root: Path | None = None
+    """Folder of the training set, in a layout that `placewise datasets check` knows."""
+    eval_roots: Annotated[tuple[Path, ...], BeforeValidator(_parse_literal)] = ()
+    """JSON list of folders with the evaluation sets. Empty: data_root."""
+    cities: NameList = CITIES
+    """Cities to train on, in this order. If omitted: all cities in the folder."""
+    batch_size: int = Field(64, ge=1)
+    """Number of places per batch."""
+    img_per_place: int = Field(2, ge=1)
+    """Number of photos per place in a batch."""
+    min_img_per_place: int = Field(2, ge=1)
+    """Skip places with fewer photos than this."""
+    shuffle_all: bool = False
+    """Shuffle places across cities. False: shuffle within each city, in turn."""
+    random_sample_from_each_place: bool = True
+    """Sample a place's photos at random. False: take its first photos."""
+    image_size: HeightWidth = (320, 320)
+    """Height and width of training photos, in pixels."""
+    interpolation: Literal["bilinear", "bicubic"] = "bilinear"
+    """Resizing of photos, which the trained model keeps: bilinear or bicubic."""
+    num_workers: int = Field(8, ge=0)
+    """Number of data loader processes. 0: load in the main process."""
+    show_data_stats: bool = True
+    """Print data set statistics before training."""
+    augmentation: Literal["randaugment", "none"] = "randaugment"
+    """Data augmentation of training photos: randaugment or none."""
+    randaugment_magnitude: int = Field(9, ge=0, le=30)
+    """Strength of randaugment's three operations, from 0 to 30."""
+    on_bad_image: Literal["skip", "error"] = "skip"
+    """Photos that cannot be decoded: skip (and report them) or error."""
+    reload_dataloaders_every_n_epochs: int = Field(1, ge=0)
+    """Reshuffle the places every n epochs. 0: shuffle once."""
 
-    lr: float = _argument(OPTIMISATION, 2e-4, "Learning rate.", gt=0)
-    optimizer: Literal["adam", "adamw", "sgd"] = _argument(
-        OPTIMISATION, "adam", "Optimizer: adam, adamw or sgd."
-    )
-    weight_decay: float = _argument(OPTIMISATION, 0.0, "Weight decay.", ge=0)
-    momentum: float = _argument(OPTIMISATION, 0.9, "Momentum of the sgd optimizer.", ge=0, lt=1)
-    warmpup_steps: int = _argument(
-        OPTIMISATION,
-        600,
-        "Number of linear learning-rate warm-up steps. Alias: --warmup_steps.",
-        ge=0,
-    )
-    milestones: IntList = _argument(
-        OPTIMISATION, (5, 10, 15, 25), "JSON list of epochs at which lr is multiplied by lr_mult."
-    )
-    lr_mult: float = _argument(OPTIMISATION, 0.3, "Learning-rate factor per milestone.", gt=0)
-    max_epochs: int = _argument(OPTIMISATION, 1, "Number of epochs.", ge=1)
-    max_steps: int | None = _argument(
-        OPTIMISATION, None, "Maximum number of steps; training may end within an epoch.", ge=1
-    )
-    seed: int = _argument(
-        OPTIMISATION, 1, "Random seed of weights, sampling and augmentation.", ge=0
-    )
+    backbone_arch: str = "resnet18"
+    """Name of the backbone, or package.module:function of your own."""
+    pretrained: bool = True
+    """Initialise the backbone with ImageNet weights."""
+    weights: Path | None = None
+    """File with the backbone's weights, or a checkpoint of the whole network to fine-tune. If
+    omitted: the torch.hub cache."""
+    layers_to_freeze: int = Field(2, ge=-1)
+    """Freeze layers up to and including this one. -1: freeze none."""
+    layers_to_crop: IntList = ()
+    """JSON list of layers to remove: 4 removes layer4, 3 also removes layer3."""
+    backbone_norm: bool = True
+    """Apply the final norm of DINOv2 and Swin. False for BoQ's published DINOv2."""
+    agg_arch: str = "AVG"
+    """Name of the aggregator, or package.module:Class of your own."""
+    agg_config: Annotated[dict[str, Any], BeforeValidator(_parse_literal)] = {}
+    """JSON dict of aggregator arguments. Channels and map size are inferred."""
 
-    loss_name: str = _argument(
-        LOSS, "MultiSimilarityLoss", "Name of the loss, or package.module:Class of your own."
-    )
-    miner_name: str = _argument(
-        LOSS, "MultiSimilarityMiner", "Name of the miner, package.module:Class, or none."
-    )
-    miner_margin: float = _argument(
-        LOSS, 0.1, "Margin of TripletMarginMiner, epsilon of MultiSimilarityMiner."
-    )
+    lr: float = Field(2e-4, gt=0)
+    """Learning rate."""
+    optimizer: Literal["adam", "adamw", "sgd"] = "adam"
+    """Optimizer: adam, adamw or sgd."""
+    weight_decay: float = Field(0.0, ge=0)
+    """Weight decay."""
+    momentum: float = Field(0.9, ge=0, lt=1)
+    """Momentum of the sgd optimizer."""
+    warmpup_steps: int = Field(600, ge=0)
+    """Number of linear learning-rate warm-up steps. Alias: --warmup_steps."""
+    milestones: IntList = (5, 10, 15, 25)
+    """JSON list of epochs at which lr is multiplied by lr_mult."""
+    lr_mult: float = Field(0.3, gt=0)
+    """Learning-rate factor per milestone."""
+    max_epochs: int = Field(1, ge=1)
+    """Number of epochs."""
+    max_steps: int | None = Field(None, ge=1)
+    """Maximum number of steps; training may end within an epoch."""
+    seed: int = Field(1, ge=0)
+    """Random seed of weights, sampling and augmentation."""
 
-    val_set_names: NameList = _argument(
-        EVALUATION, ("sfxs_val",), "Validation sets. If omitted: those found in the folder."
-    )
-    test_set_names: NameList = _argument(
-        EVALUATION,
-        ("sfxs_test", "tokyoxs_test"),
-        "Test sets of the phases test and all. If omitted: those found in the folder.",
-    )
-    val_image_size: HeightWidth | None = _argument(
-        EVALUATION,
-        None,
-        "Height and width of validation photos, which the trained model keeps. If omitted: "
-        "image_size.",
-    )
+    loss_name: str = "MultiSimilarityLoss"
+    """Name of the loss, or package.module:Class of your own."""
+    miner_name: str = "MultiSimilarityMiner"
+    """Name of the miner, package.module:Class, or none."""
+    miner_margin: float = 0.1
+    """Margin of TripletMarginMiner, epsilon of MultiSimilarityMiner."""
+
+    val_set_names: NameList = ("sfxs_val",)
+    """Validation sets. If omitted: those found in the folder."""
+    test_set_names: NameList = ("sfxs_test", "tokyoxs_test")
+    """Test sets of the phases test and all. If omitted: those found in the folder."""
+    val_image_size: HeightWidth | None = None
+    """Height and width of validation photos, which the trained model keeps. If omitted:
+    image_size."""
     test_image_size: Annotated[
         Literal["same", "native"] | HeightWidth, BeforeValidator(_parse_image_size)
-    ] = _argument(
-        EVALUATION,
-        "same",
-        "Test photo size: same as in validation, native (batches of one), or H W pixels.",
-    )
-    faiss_gpu: bool = _argument(EVALUATION, True, "Run the faiss search on the GPU.")
-    check_val_every_n_epoch: int = _argument(
-        EVALUATION, 1, "Validate every n epochs, and after the last.", ge=1
-    )
-    save_val_predictions: bool = _argument(
-        EVALUATION, False, "Save the predictions of each validation. Those of tests always are."
-    )
-    num_sanity_val_steps: int = _argument(
-        EVALUATION, 0, "Number of validation batches run before training. -1: all.", ge=-1
-    )
+    ] = "same"
+    """Test photo size: same as in validation, native (batches of one), or H W pixels."""
+    faiss_gpu: bool = True
+    """Run the faiss search on the GPU."""
+    check_val_every_n_epoch: int = Field(1, ge=1)
+    """Validate every n epochs, and after the last."""
+    save_val_predictions: bool = False
+    """Save the predictions of each validation. Those of tests always are."""
+    num_sanity_val_steps: int = Field(0, ge=-1)
+    """Number of validation batches run before training. -1: all."""
 
-    experiment_phase: Literal["train", "test", "all"] = _argument(
-        RUN, "train", "train, test (a checkpoint), or all: train, then test the best checkpoint."
-    )
-    model_path: Path | None = _argument(
-        RUN, None, "Checkpoint to test (phase test) or to initialise training from."
-    )
-    default_root_dir: str = _argument(RUN, "./LOGS/", "Root folder of the runs.")
-    compatible: bool = _argument(
-        RUN,
-        False,
-        "Train and test as the GSV-Cities script did where an argument means something else here: "
-        "adam is AdamW, no layer is frozen, tests at native size, warm-up before milestones.",
-    )
-    run_name: str | None = _argument(
-        RUN, None, "Folder name of this run. If omitted: a timestamp and the model's name."
-    )
+    experiment_phase: Literal["train", "test", "all"] = "train"
+    """train, test (a checkpoint), or all: train, then test the best checkpoint."""
+    model_path: Path | None = None
+    """Checkpoint to test (phase test) or to initialise training from."""
+    default_root_dir: str = "./LOGS/"
+    """Root folder of the runs."""
+    compatible: bool = False
+    """Train and test as the GSV-Cities script did where an argument means something else here: adam
+    is AdamW, no layer is frozen, tests at native size, warm-up before milestones."""
+    run_name: str | None = None
+    """Folder name of this run. If omitted: a timestamp and the model's name."""
     logger: Annotated[
         tuple[Literal["csv", "tensorboard", "wandb", "mlflow", "none"], ...],
         BeforeValidator(_parse_names),
-    ] = _argument(
-        RUN, ("tensorboard", "csv"), "List of csv, tensorboard, wandb and mlflow, or none."
-    )
-    log_every_n_steps: int = _argument(RUN, 20, "Number of steps between log entries.", ge=1)
-    fast_dev_run: bool = _argument(
-        RUN, False, "Run one batch of training and validation as a check; write no files."
-    )
+    ] = ("tensorboard", "csv")
+    """List of csv, tensorboard, wandb and mlflow, or none."""
+    log_every_n_steps: int = Field(20, ge=1)
+    """Number of steps between log entries."""
+    fast_dev_run: bool = False
+    """Run one batch of training and validation as a check; write no files."""
 
-    monitor: str = _argument(
-        CHECKPOINTS, "sfxs_val/R1", "Metric by which the best checkpoints are chosen."
-    )
-    mode: Literal["min", "max"] = _argument(
-        CHECKPOINTS, "max", "Direction of the monitored metric: max or min."
-    )
-    save_top_k: int = _argument(
-        CHECKPOINTS, 3, "Number of best checkpoints to keep. -1: all, 0: none.", ge=-1
-    )
-    save_weights_only: bool = _argument(
-        CHECKPOINTS, True, "Save best checkpoints without optimizer state; last.ckpt has it always."
-    )
-    filename: str = _argument(
-        CHECKPOINTS,
-        "{backbone_arch}_epoch({epoch:02d})_step({step:04d})_R1[{R1:.4f}]_R5[{R5:.4f}]",
-        "Name template of the best checkpoints. R1 is the monitored set's; SET/R1 names others.",
-    )
-    auto_insert_metric_name: bool = _argument(
-        CHECKPOINTS, False, "Insert each metric's name before its value in the file name."
-    )
+    monitor: str = "sfxs_val/R1"
+    """Metric by which the best checkpoints are chosen."""
+    mode: Literal["min", "max"] = "max"
+    """Direction of the monitored metric: max or min."""
+    save_top_k: int = Field(3, ge=-1)
+    """Number of best checkpoints to keep. -1: all, 0: none."""
+    save_weights_only: bool = True
+    """Save best checkpoints without optimizer state; last.ckpt has it always."""
+    filename: str = "{backbone_arch}_epoch({epoch:02d})_step({step:04d})_R1[{R1:.4f}]_R5[{R5:.4f}]"
+    """Name template of the best checkpoints. R1 is the monitored set's; SET/R1 names others."""
+    auto_insert_metric_name: bool = False
+    """Insert each metric's name before its value in the file name."""
 
-    accelerator: Literal["gpu", "cuda", "mps", "cpu", "auto"] = _argument(
-        MACHINE, "gpu", "Training accelerator: gpu, cuda, mps, cpu or auto."
-    )
-    devices: Annotated[int | str | tuple[int, ...], BeforeValidator(_parse_literal)] = _argument(
-        MACHINE, (0,), "Device to train on: its index as [0], or 1 for any."
-    )
-    precision: Annotated[int | str, BeforeValidator(_parse_literal)] = _argument(
-        MACHINE, 32, "Floating-point precision: 32, 16-mixed or bf16-mixed."
-    )
-    compile: bool = _argument(
-        MACHINE, False, "Compile the network with torch.compile. Sums may differ in last digits."
-    )
-    reload_dataloaders_every_n_epochs: int = _argument(
-        DATA, 1, "Reshuffle the places every n epochs. 0: shuffle once.", ge=0
-    )
+    accelerator: Literal["gpu", "cuda", "mps", "cpu", "auto"] = "gpu"
+    """Training accelerator: gpu, cuda, mps, cpu or auto."""
+    devices: Annotated[int | str | tuple[int, ...], BeforeValidator(_parse_literal)] = (0,)
+    """Device to train on: its index as [0], or 1 for any."""
+    precision: Annotated[int | str, BeforeValidator(_parse_literal)] = 32
+    """Floating-point precision: 32, 16-mixed or bf16-mixed."""
+    compile: bool = False
+    """Compile the network with torch.compile. Sums may differ in last digits."""
 
     @property
     def evaluation_size(self) -> tuple[int, int]:
@@ -313,11 +267,12 @@ class TrainingArguments(BaseModel):
         return tuple(name for name in names if name != "none")
 
 
-def argument_group(name: str) -> str:
-    """Return the help panel of an argument."""
-    extra = TrainingArguments.model_fields[name].json_schema_extra
-    assert isinstance(extra, dict)
-    return str(extra["group"])
+def argument_groups() -> dict[str, str]:
+    """Return the help panel of each argument."""
+    groups, group = {}, ""
+    for name in TrainingArguments.model_fields:
+        group = groups[name] = FIRST_OF_GROUP.get(name, group)
+    return groups
 
 
 ALIASES = {"warmup_steps": "warmpup_steps"}
@@ -421,8 +376,7 @@ def load_mapping(path: Path) -> dict[str, Any]:
 def resolve_keys(values: Mapping[str, Any], source: str) -> dict[str, Any]:
     """Replace each key with the argument's canonical name.
 
-    Raises:
-        InvalidRequest: `unknown_argument`; the message begins with `source`.
+    Raises InvalidRequest: `unknown_argument`; the message begins with `source`.
     """
     resolved = {normalise_name(key): value for key, value in values.items()}
     unknown = [name for name in resolved if name not in TrainingArguments.model_fields]
@@ -445,8 +399,7 @@ EXPECTED_VALUES = {
 def build_arguments(*layers: Mapping[str, Any]) -> TrainingArguments:
     """Merge and validate arguments; later layers override earlier ones.
 
-    Raises:
-        InvalidRequest: `bad_argument`; the message names each invalid argument and its value.
+    Raises InvalidRequest: `bad_argument`; the message names each invalid argument and its value.
     """
     merged = {name: value for layer in layers for name, value in layer.items()}
     try:

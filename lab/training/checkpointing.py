@@ -48,12 +48,9 @@ class CheckpointNameTemplate:
         monitored_set: the set of metrics without a set's name.
         insert_names: write `name=value` instead of the value.
 
-    Attributes:
-        dropped_fields: fields that the run does not log. They are removed from the template
-            together with their label and brackets.
-
-    Raises:
-        InvalidRequest: `bad_argument` if no field and no text remains, or a format does not fit.
+    `dropped_fields` are those that the run does not log; they are removed with their label and
+    brackets. Raises InvalidRequest (`bad_argument`) if no field and no text remains, or a format
+    does not fit.
     """
 
     def __init__(
@@ -103,8 +100,7 @@ class CheckpointNameTemplate:
 def format_folder(template: str, fixed: Mapping[str, Any]) -> str:
     """Fill arguments into the template of a folder's path.
 
-    Raises:
-        InvalidRequest: `bad_argument` for a field that is not an argument.
+    Raises InvalidRequest: `bad_argument` for a field that is not an argument.
     """
 
     def fill(match: re.Match[str]) -> str:
@@ -170,10 +166,7 @@ class TopKCheckpoints:
     ) -> bool:
         """Save a checkpoint if its score is among the `top_k` best, and remove the worst.
 
-        A score of NaN is never saved.
-
-        Returns:
-            Whether the checkpoint was saved.
+        Returns whether it was saved; a score of NaN never is.
         """
         score = metrics.get(self.monitor, math.nan)
         rank = sum(not self._is_better(score, stored) for stored, _ in self.best)
@@ -227,8 +220,7 @@ REQUIRED_STATE = {
 def load_training_state(path: Path) -> dict[str, Any]:
     """Load a checkpoint that holds the full training state, to resume from.
 
-    Raises:
-        Unprocessable: `checkpoint_unreadable` if it is damaged or holds weights alone.
+    Raises Unprocessable: `checkpoint_unreadable` if it is damaged or holds weights alone.
     """
     try:
         stored = torch.load(path, map_location="cpu", weights_only=True)

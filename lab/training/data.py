@@ -49,8 +49,7 @@ class EvaluationSets:
 def select_training_set(arguments: TrainingArguments) -> TrainingSet:
     """Open the training set; without explicit `cities`, all cities of the folder.
 
-    Raises:
-        InvalidRequest: `data_root_missing`; also raises what `open_training_set` raises.
+    Raises InvalidRequest: `data_root_missing`; also raises what `open_training_set` raises.
     """
     is_explicit = "cities" in arguments.model_fields_set
     return open_training_set(
@@ -67,9 +66,7 @@ def select_evaluation_sets(arguments: TrainingArguments) -> EvaluationSets:
     if there are none, those with `val` in their names for validation and `test` for tests; if there
     are none of these either, all sets of the folder.
 
-    Raises:
-        NotFound: `set_missing`; the message lists the available sets.
-        InvalidRequest: `data_root_missing`.
+    Raises NotFound (`set_missing`), InvalidRequest (`data_root_missing`).
     """
     roots = arguments.eval_roots or (_require_data_root(arguments),)
     available: dict[str, Path] = {}
@@ -255,10 +252,8 @@ class Batch(NamedTuple):
 class PlaceDataset(Dataset[Batch]):
     """Decodes, augments and normalises the photos of one `PlaceSample`.
 
-    A photo that cannot be decoded is skipped and listed in `Batch.undecodable`.
-
-    Raises:
-        Unprocessable: `undecodable_photo`, if `fail_on_undecodable` is set.
+    A photo that cannot be decoded is listed in `Batch.undecodable`, or with `fail_on_undecodable`
+    raises Unprocessable (`undecodable_photo`).
     """
 
     def __init__(

@@ -87,14 +87,10 @@ class _GridFile(BaseModel):
 
 
 def load_grid_plan(path: Path, overrides: Mapping[str, Any]) -> GridPlan:
-    """Load a grid from a YAML file and validate the arguments of all runs.
+    """Load a grid from a YAML file and validate the arguments of all runs, after `overrides`.
 
-    `overrides` are arguments that override those of every run.
-
-    Raises:
-        NotFound: `config_not_found`.
-        InvalidRequest: `bad_grid`, `unknown_argument`, `bad_argument`. Also raises the errors of
-            an unknown backbone, aggregator, loss or miner.
+    Raises NotFound (`config_not_found`), InvalidRequest (`bad_grid`, `unknown_argument`,
+    `bad_argument`), and the errors of an unknown backbone, aggregator, loss or miner.
     """
     try:
         stored = _GridFile.model_validate(load_mapping(path))
@@ -212,8 +208,7 @@ class RunOutcome:
 def load_outcome(planned: PlannedRun, out: Path) -> RunOutcome:
     """Determine the state of a planned run from its folder below `out`.
 
-    Raises:
-        Conflict: `grid_run_differs`, if the folder's run has other arguments.
+    Raises Conflict: `grid_run_differs`, if the folder's run has other arguments.
     """
     folder = out / planned.name
     if (folder / CONFIG_FILE).is_file():
@@ -236,18 +231,12 @@ def run_grid(
     stop: StopRequest,
     after_each: Callable[[list[RunOutcome]], None],
 ) -> list[RunOutcome]:
-    """Execute all unfinished runs sequentially.
+    """Execute all unfinished runs below `out` one after the other; a failed run does not stop them.
 
-    A failed run does not stop the others.
+    `after_each` is called with all outcomes, in the order of the plan, after each run.
 
-    `out` is the root folder of the runs. `after_each` is called with all outcomes after each run.
-
-    Returns:
-        The outcomes in the order of the plan.
-
-    Raises:
-        RunStopped: a stop was requested; also raises what `load_outcome` raises.
-        Conflict: `run_in_use`, while another process executes the grid.
+    Raises RunStopped if a stop was requested, Conflict (`run_in_use`) while another process
+    executes the grid, and what `load_outcome` raises.
     """
     out.mkdir(parents=True, exist_ok=True)
     with lock_folder(out):
@@ -277,12 +266,9 @@ _HARMLESS_ARGUMENTS = {"loss_name", "miner_name", "miner_margin", "lr", "max_epo
 
 
 def find_grid_obstacles(plan: GridPlan) -> dict[str, list[str]]:
-    """Check whether each run of a grid could start on this machine.
+    """Return the names of the runs that can't start on this machine, by error ("code: detail").
 
     Runs that differ only in their training settings are checked once.
-
-    Returns:
-        Names of the runs that can't start, by error ("code: detail").
     """
     checked: dict[str, list[PlacewiseError]] = {}
     blocked: dict[str, list[str]] = {}

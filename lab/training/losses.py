@@ -26,11 +26,7 @@ from shared.errors import Unprocessable
 
 
 def _match_name(name: str, known: Sequence[str], *, suffix: str, argument: str) -> str:
-    """Return the element of `known` that equals `name`, ignoring case and the suffix.
-
-    Raises:
-        Unprocessable: `unknown_loss` or `unknown_miner`, by the suffix; lists the known names.
-    """
+    """Return the known name that equals `name`, ignoring case and the suffix, or raise an error."""
     key = name.strip().lower().removesuffix(suffix.lower())
     for candidate in known:
         if candidate.lower().removesuffix(suffix.lower()) == key:
@@ -109,17 +105,11 @@ LOSSES: dict[str, Callable[[], nn.Module]] = {
 
 
 def make_loss(name: str) -> nn.Module:
-    """Create a loss by name.
+    """Create a loss: a key of LOSSES, in any case, also without `Loss`; or `package.module:Class`.
 
-    The loss is called with (B, D) float32 embeddings, (B,) labels, and the indices that a miner
-    returned; None uses all pairs of the batch.
-
-    Args:
-        name: a key of LOSSES, in any case, with or without `Loss`; or `package.module:Class`.
-
-    Raises:
-        Unprocessable: `unknown_loss`.
-        InvalidRequest: `own_module_unusable`.
+    It is called with (B, D) float32 embeddings, (B,) labels, and the indices that a miner returned;
+    None uses all pairs of the batch. Raises Unprocessable (`unknown_loss`), InvalidRequest
+    (`own_module_unusable`).
     """
     if is_own_module(name):
         return make_own_module("loss_name", name)
@@ -139,12 +129,9 @@ class AngularMiner(nn.Module):
     """
 
     def __init__(self, angle: float, max_block_values: int = MAX_BLOCK_VALUES) -> None:
-        """Create the miner.
+        """Create the miner with a minimum angle, in degrees.
 
-        Args:
-            angle: minimum angle, in degrees.
-            max_block_values: maximum number of values in an intermediate tensor; exceeded only
-                if a single pair needs more.
+        An intermediate tensor exceeds `max_block_values` only if a single pair needs more.
         """
         super().__init__()
         self.tangent = math.tan(math.radians(angle))
@@ -152,11 +139,9 @@ class AngularMiner(nn.Module):
 
     @torch.no_grad()
     def forward(self, rows: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the indices of anchors, positives and negatives, each (triplets,) int64.
+        """Return the (triplets,) int64 indices of anchors, positives and negatives.
 
-        Args:
-            rows: (B, D) L2-normalised embeddings.
-            labels: (B,) place labels.
+        `rows` are (B, D) L2-normalised embeddings, `labels` (B,) place labels.
         """
         a, p, _, _ = loss_and_miner_utils.get_all_pairs_indices(labels)
         block_pairs = max(1, self.max_block_values // max(rows.shape))
@@ -194,23 +179,14 @@ MINERS: dict[str, Callable[[float], nn.Module]] = {
 
 
 def make_miner(name: str | None, margin: float = 0.1) -> nn.Module | None:
-    """Create a miner by name.
+    """Create a miner: a key of MINERS in any case, also without `Miner`; or `package.module:Class`.
 
-    The miner is called with (B, D) float32 embeddings and (B,) labels, and returns indices into
-    the batch: pairs (a1, p, a2, n) or triplets (a, p, n).
+    It is called with (B, D) float32 embeddings and (B,) labels, and returns indices into the batch:
+    pairs (a1, p, a2, n) or triplets (a, p, n). With `none` or None, the loss uses all pairs.
+    `margin` is the epsilon of MultiSimilarityMiner (cosine) or the margin of TripletMarginMiner
+    (distance); the other miners ignore it, as in the GSV-Cities code.
 
-    Args:
-        name: a key of MINERS, in any case, with or without `Miner`; `package.module:Class`; `none`
-            or None for no miner.
-        margin: epsilon of MultiSimilarityMiner (cosine) or margin of TripletMarginMiner (distance);
-            ignored by the other miners, as in the GSV-Cities code.
-
-    Returns:
-        The miner, or None: the loss then uses all pairs.
-
-    Raises:
-        Unprocessable: `unknown_miner`.
-        InvalidRequest: `own_module_unusable`.
+    Raises Unprocessable (`unknown_miner`), InvalidRequest (`own_module_unusable`).
     """
     if name is None or name.strip().lower() == NO_MINER:
         return None
@@ -225,12 +201,9 @@ def batch_accuracy(
 ) -> float | None:
     """Return `b_acc` of the GSV-Cities code: the share of photos without a mined pair or triplet.
 
-    These are the photos whose places the network already distinguishes.
-
-    Returns:
-        A share from 0 to 1. None where it is not meaningful: without a miner, with FastAP (mined
-        pairs are weights there, so every photo is an anchor), and with the histogram miner (which
-        samples pairs independently of what was learned).
+    These are the photos whose places the network already distinguishes. None where it is not
+    meaningful: without a miner, with FastAP (mined pairs are weights there, so every photo is an
+    anchor), and with the histogram miner (which samples pairs independently of what was learned).
     """
     if miner is None or isinstance(loss, FastAPLoss):
         return None

@@ -25,13 +25,11 @@ from shared.imaging.preprocessing import Pixels, Preprocessing, get_preprocessin
 
 
 class ModelDescriber:
-    """Computes the descriptors of photo files with a network.
+    """Computes the descriptors of photo files with a network, (B, 3, H, W) float32 -> (B, D).
 
-    The network's training mode is restored after each call.
+    Photos are normalised as for ImageNet. The network's training mode is restored after each call.
 
     Args:
-        model: (B, 3, H, W) float32, ImageNet-normalised -> (B, D).
-        device: device of the network.
         image_size: (height, width) to which photos are resized without keeping the aspect ratio,
             antialiased, as in training. None keeps each photo's size; photos of equal size form a
             batch.
@@ -39,9 +37,7 @@ class ModelDescriber:
         batch_photos: number of photos read and described at a time.
         max_pixels: larger photos are refused.
 
-    Attributes:
-        seconds: time spent in the network, by `inference_clock`, in seconds.
-        photos: number of photos described in that time.
+    `seconds` is the time spent in the network, by `inference_clock`, for `photos` photos.
     """
 
     def __init__(
@@ -72,8 +68,7 @@ class ModelDescriber:
     def __call__(self, photos: Sequence[Path]) -> Iterator[Rows]:
         """Yield (n, D) float32 descriptors, batch by batch, in the order of the photos.
 
-        Raises:
-            PlacewiseError: one error for all photos that cannot be read, decoded or processed.
+        Raises one error for all photos that cannot be read, decoded or processed.
         """
         refused: list[tuple[Path, PlacewiseError]] = []
         was_training = self._model.training
@@ -106,10 +101,7 @@ class ModelDescriber:
     def _decode_batches(
         self, photos: Sequence[Path]
     ) -> Iterator[tuple[Sequence[Path], list[Pixels | PlacewiseError]]]:
-        """Decode batch by batch; on a GPU, the next one is decoded meanwhile.
-
-        On a CPU, the time of decoding would count as that of the network.
-        """
+        """Decode batch by batch; on a GPU one ahead, which on a CPU would slow the network."""
         step, decodes_ahead = self._batch_photos, self._device.type != "cpu"
         with ThreadPoolExecutor(os.cpu_count()) as threads:  # decoding releases the GIL
             ahead = None

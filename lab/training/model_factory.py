@@ -41,11 +41,8 @@ def make_model(arguments: TrainingArguments, display: Display, *, resuming: bool
     """Create the network with pretrained weights, those of a checkpoint, or random weights.
 
     Random weights depend on the global seed. With `resuming`, the weights are loaded later, from
-    the run's checkpoint.
-
-    Raises:
-        Conflict: `run_differs`, if the checkpoint's network differs from the arguments'. Also
-            raises what `build_vpr_model` and `load_checkpoint` raise.
+    the run's checkpoint. Raises Conflict (`run_differs`) if the checkpoint's network differs from
+    the arguments', and what `build_vpr_model` and `load_checkpoint` raise.
     """
     config = build_model_config(arguments)
     checkpoint = _initial_checkpoint(arguments)
@@ -76,10 +73,7 @@ _missing_weights: dict[tuple[str, str], str] = {}
 
 
 def _build_pretrained_model(config: VprModelConfig, weights: Path | None) -> VprModel:
-    """As `build_vpr_model`, but weights that can't be downloaded are tried once in a process.
-
-    Without a network, a download fails after minutes, and a grid has many runs with one backbone.
-    """
+    """Build the network; a failed download, which takes minutes, is not repeated."""
     key = config.backbone_arch, torch.hub.get_dir()
     if config.pretrained and weights is None and key in _missing_weights:
         raise Misconfigured("weights_missing", _missing_weights[key])
@@ -155,9 +149,8 @@ def register_own_modules(arguments: TrainingArguments) -> None:
 def make_own_module(argument: str, path: str) -> nn.Module:
     """Create a loss or miner of the user by calling what `path` names, without arguments.
 
-    Raises:
-        InvalidRequest: `own_module_unusable`; also for a module with parameters, because the
-            optimizer trains those of the network only.
+    Raises InvalidRequest: `own_module_unusable`; also for a module with parameters, because the
+    optimizer trains those of the network only.
     """
     try:
         made = _import_object(argument, path)()
@@ -171,11 +164,7 @@ def make_own_module(argument: str, path: str) -> nn.Module:
 
 
 def _import_object(argument: str, path: str) -> Any:
-    """Import `package.module:Name`; modules in the working directory are found, too.
-
-    Raises:
-        InvalidRequest: `own_module_unusable`.
-    """
+    """Import `package.module:Name`; modules in the working directory are found, too."""
     module_name, _, name = path.partition(":")
     here = str(Path.cwd())
     if here not in sys.path:

@@ -41,9 +41,8 @@ PRECISION_ALIASES = {
 def make_fabric(arguments: TrainingArguments) -> Fabric:
     """Create the Fabric of a run: one device and a precision.
 
-    Raises:
-        Misconfigured: `no_gpu`.
-        InvalidRequest: `several_devices`, `unknown_precision`, `needs_gpu`.
+    Raises Misconfigured (`no_gpu`), InvalidRequest (`several_devices`, `unknown_precision`,
+    `needs_gpu`).
     """
     accelerator = _resolve_accelerator(arguments.accelerator)
     index = _device_index(arguments.devices)
@@ -137,8 +136,7 @@ def _continue_csv(folder: Path, completed_steps: int) -> CSVLogger:
 def check_loggers(names: tuple[str, ...]) -> None:
     """Check that the loggers' packages are installed.
 
-    Raises:
-        Misconfigured: `logger_missing`.
+    Raises Misconfigured: `logger_missing`.
     """
     for name in names:
         if name != "csv" and importlib.util.find_spec(name) is None:
@@ -205,8 +203,7 @@ def resolve_arguments(
 ) -> TrainingArguments:
     """Fill in the arguments that depend on the data: sets, cities, absolute paths, monitor.
 
-    Raises:
-        InvalidRequest: `bad_argument`, if places may have fewer than `img_per_place` photos.
+    Raises InvalidRequest: `bad_argument`, if places may have fewer than `img_per_place` photos.
     """
     if arguments.img_per_place > arguments.min_img_per_place:
         raise InvalidRequest(
@@ -231,8 +228,7 @@ def make_checkpoints(
 ) -> TopKCheckpoints:
     """Create the checkpoint settings of a run.
 
-    Raises:
-        InvalidRequest: `unknown_metric`, `bad_argument`.
+    Raises InvalidRequest: `unknown_metric`, `bad_argument`.
     """
     metrics = [f"{each.name}/R{k}" for each in sets.validation for k in VALIDATION_KS]
     if not metrics:
@@ -262,9 +258,9 @@ def make_checkpoints(
     )
 
 
+LOCAL_PATHS = {"data_root", "eval_roots", "weights", "model_path", "default_root_dir"}
+
+
 def portable_arguments(arguments: TrainingArguments) -> Json:
     """Return the arguments that a checkpoint stores: all except local paths."""
-    plain = to_plain_dict(arguments)
-    for name in ("data_root", "eval_roots", "weights", "model_path", "default_root_dir"):
-        plain.pop(name)
-    return plain
+    return arguments.model_dump(mode="json", exclude=LOCAL_PATHS)

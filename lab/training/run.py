@@ -96,12 +96,8 @@ def _listing_all_obstacles(arguments: TrainingArguments) -> Iterator[None]:
 def run(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Json:
     """Start a run and execute its phase: train, test, or all.
 
-    Returns:
-        The content of `metrics.json`; `{"fast_dev_run": True}` for a fast development run.
-
-    Raises:
-        RunStopped: a stop was requested; the message says how to resume. Also raises every error
-            of arguments and data.
+    Returns the content of `metrics.json`; `{"fast_dev_run": True}` for a fast development run.
+    Raises RunStopped, whose message says how to resume, and every error of arguments and data.
     """
     if arguments.experiment_phase == "test":
         return _run_test_phase(arguments, display, stop)
@@ -140,11 +136,8 @@ def run(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Js
 def resume(path: Path, changes: Json, display: Display, stop: StopRequest) -> Json:
     """Resume an interrupted run, or continue a finished one for more epochs.
 
-    `path` is the run's folder, or one of its checkpoints with the full state. `changes` are
-    arguments that override the stored ones.
-
-    Returns:
-        The content of `metrics.json`.
+    `path` is the run's folder, or one of its checkpoints with the full state; `changes` are
+    arguments that override the stored ones. Returns the content of `metrics.json`.
 
     Raises:
         NotFound: `run_not_found`.

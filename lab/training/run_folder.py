@@ -81,8 +81,7 @@ def create_run_folder(arguments: TrainingArguments) -> Path:
 def find_run(resume: Path) -> tuple[Path, Path]:
     """Find the folder and the checkpoint of a run, given either of them, to resume from.
 
-    Raises:
-        NotFound: `run_not_found`.
+    Raises NotFound: `run_not_found`.
     """
     if resume.is_dir():
         folder, checkpoint = resume, resume / CHECKPOINTS_FOLDER / "last.ckpt"
@@ -103,9 +102,7 @@ def find_run(resume: Path) -> tuple[Path, Path]:
 def lock_folder(folder: Path) -> Iterator[None]:
     """Lock the folder of a run or grid for this process while the block runs.
 
-    Raises:
-        Conflict: `run_in_use`.
-        Misconfigured: `out_unwritable`.
+    Raises Conflict (`run_in_use`), Misconfigured (`out_unwritable`).
     """
     lock = FileLock(folder / LOCK_FILE, timeout=0)
     try:
@@ -125,8 +122,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
 def load_resumed_arguments(folder: Path, changes: dict[str, Any]) -> TrainingArguments:
     """Load a run's arguments and apply changes.
 
-    Raises:
-        Conflict: `run_differs`, for a change of an argument not in `RESUMABLE_ARGUMENTS`.
+    Raises Conflict: `run_differs`, for a change of an argument not in `RESUMABLE_ARGUMENTS`.
     """
     stored = load_yaml(folder / CONFIG_FILE)
     arguments = build_arguments(stored, changes)
@@ -145,10 +141,7 @@ def check_trained_arguments(
 ) -> None:
     """Check that a checkpoint was trained with the arguments of the run that resumes from it.
 
-    `trained` are the arguments that the checkpoint stores.
-
-    Raises:
-        Conflict: `run_differs`, naming each argument that decides the training and differs.
+    Raises Conflict (`run_differs`), naming each argument that decides the training and differs.
     """
     differing = _list_differences(trained, arguments)
     if differing:
@@ -239,8 +232,7 @@ class TrainingHistory(BaseModel):
     def load(cls, folder: Path) -> Self:
         """Load `history.json` of a run's folder.
 
-        Raises:
-            Unprocessable: `run_unreadable`.
+        Raises Unprocessable: `run_unreadable`.
         """
         try:
             return cls.model_validate_json((folder / HISTORY_FILE).read_text())

@@ -144,9 +144,8 @@ class TrainingLoop:
     def restore(self, checkpoint: Path) -> None:
         """Restore the full training state.
 
-        Raises:
-            Conflict: `run_differs`, if the checkpoint belongs to a run with other arguments, or the
-                run ends before it. Also raises what `load_training_state` raises.
+        Raises Conflict (`run_differs`) if the checkpoint belongs to a run with other arguments, or
+        the run ends before it, and what `load_training_state` raises.
         """
         stored = load_training_state(checkpoint)
         check_trained_arguments(self._arguments, stored["hyper_parameters"]["training"], checkpoint)
@@ -184,10 +183,8 @@ class TrainingLoop:
     def fit(self, loggers: Sequence[Logger]) -> None:
         """Train to the last step of the last epoch, or to `max_steps`.
 
-        Raises:
-            RunStopped: a stop was requested; `last.ckpt` holds the state after the last step.
-            Unprocessable: `no_photo_decodes`, `loss_not_finite`; also raises what reading photos
-                and validation raise.
+        Raises RunStopped after a requested stop (`last.ckpt` holds the state after the last step),
+        Unprocessable (`no_photo_decodes`, `loss_not_finite`), and what validation raises.
         """
         while self.completed_steps < self._last_step:
             self._train_epoch(loggers)

@@ -38,16 +38,10 @@ class Validator:
     def measure(
         self, model: torch.nn.Module, sets: Sequence[EvaluationSet], *, for_tests: bool = False
     ) -> dict[str, RecallEvaluation]:
-        """Evaluate the network, (B, 3, H, W) float32 -> (B, D), on each set.
+        """Return rankings and recalls of the network, (B, 3, H, W) float32 -> (B, D), by set name.
 
         Its training mode is restored afterwards. `for_tests` selects `test_image_size` instead of
-        `val_image_size`.
-
-        Returns:
-            Rankings and recalls by set name.
-
-        Raises:
-            RunStopped: a stop was requested; also raises what describing and searching raise.
+        `val_image_size`. Raises RunStopped, and what describing and searching raise.
         """
         size = self._test_size() if for_tests else self.arguments.evaluation_size
         describe = ModelDescriber(

@@ -128,14 +128,7 @@ def train(
     continued with --resume.
     """
     require_packages(*TRAINING_PACKAGES)
-    report = _run_training(config, resume, given_options(arguments))
-    if as_json:
-        print_json(report)
-    else:
-        _print_summary(report)
-
-
-def _run_training(config: Path | None, resume: Path | None, overrides: dict[str, Any]) -> Any:
+    overrides = given_options(arguments)
     if config is not None and resume is not None:
         raise InvalidRequest(
             "bad_argument", "--resume uses the run's own arguments. Remove --config."
@@ -154,11 +147,16 @@ def _run_training(config: Path | None, resume: Path | None, overrides: dict[str,
         display = _TerminalDisplay(bars)
         try:
             if resume is not None:
-                return run.resume(resume, overrides, display, stop)
-            return run.run(build_arguments(*layers, overrides), display, stop)
+                report = run.resume(resume, overrides, display, stop)
+            else:
+                report = run.run(build_arguments(*layers, overrides), display, stop)
         except RunStopped as stopped:
             print_note(str(stopped))
             raise typer.Exit(EXIT_INTERRUPTED) from stopped
+    if as_json:
+        print_json(report)
+    else:
+        _print_summary(report)
 
 
 @with_training_options
@@ -184,14 +182,6 @@ def grid(
     grid continues. Options of `placewise train` override those of every run.
     """
     require_packages(*TRAINING_PACKAGES)
-    failed = _run_grid_command(file, out, dry_run, as_json, given_options(arguments))
-    if failed:
-        raise typer.Exit(1)
-
-
-def _run_grid_command(
-    file: Path, out: Path, dry_run: bool, as_json: bool, overrides: dict[str, Any]
-) -> int:
     from lab.training.grid import (
         RunOutcome,
         RunState,
@@ -203,16 +193,25 @@ def _run_grid_command(
     from lab.training.leaderboard import leaderboard, write_leaderboard
     from lab.training.run_control import RunStopped, StopRequest
 
-    plan = load_grid_plan(file, overrides)
+    plan = load_grid_plan(file, given_options(arguments))
     if dry_run:
         outcomes = [load_outcome(planned, out) for planned in plan.runs]
-        _print_rows([{"run": o.run.name, "state": str(o.state), **_to_strings(o.run.arguments)}
-               for o in outcomes], as_json)  # fmt: skip
+        rows = [
+            {"run": o.run.name, "state": str(o.state)}
+            | {name: str(value) for name, value in o.run.arguments.items()}
+            for o in outcomes
+        ]
+        if as_json:
+            print_json(rows)
+        else:
+            _print_rows(rows)
         obstacles = find_grid_obstacles(plan)
         for obstacle, blocked in obstacles.items():
             names = ", ".join(blocked) if len(blocked) < len(plan.runs) else "every run"
             print_note(f"{names} can't start: {obstacle}")
-        return len(obstacles)
+        if obstacles:
+            raise typer.Exit(1)
+        return
 
     def write(outcomes: list[RunOutcome]) -> None:
         out.mkdir(parents=True, exist_ok=True)
@@ -229,19 +228,13 @@ def _run_grid_command(
     if as_json:
         print_json([asdict(outcome) for outcome in outcomes])
     else:
-        _print_rows(leaderboard(plan, outcomes), False)
+        _print_rows(leaderboard(plan, outcomes))
         print_message(f"Wrote {out}/leaderboard.csv and {out}/leaderboard.md")
-    return sum(outcome.state is not RunState.FINISHED for outcome in outcomes)
+    if any(outcome.state is not RunState.FINISHED for outcome in outcomes):
+        raise typer.Exit(1)
 
 
-def _to_strings(arguments: dict[str, Any]) -> dict[str, str]:
-    return {name: str(value) for name, value in arguments.items()}
-
-
-def _print_rows(rows: list[dict[str, str]], as_json: bool) -> None:
-    if as_json:
-        print_json(rows)
-        return
+def _print_rows(rows: list[dict[str, str]]) -> None:
     columns = list(dict.fromkeys(column for row in rows for column in row))
     # Leave out columns whose value is the same for all runs.
     if len(rows) > 1:

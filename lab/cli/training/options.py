@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from lab.training.arguments import TrainingArguments, argument_group, normalise_name
+from lab.training.arguments import TrainingArguments, argument_groups, normalise_name
 
 FIELDS = TrainingArguments.model_fields
 BOOLEANS = {name for name, field in FIELDS.items() if field.annotation is bool}
@@ -32,7 +32,8 @@ def with_training_options(command: Callable[..., None]) -> Callable[..., None]:
         for parameter in inspect.signature(command, eval_str=True).parameters.values()
         if parameter.kind is not inspect.Parameter.VAR_KEYWORD
     ]
-    parameters = [*own_parameters, *map(_make_option, FIELDS)]
+    options = (_make_option(name, group) for name, group in argument_groups().items())
+    parameters = [*own_parameters, *options]
     decorated: Any = command
     decorated.__signature__ = inspect.Signature(parameters)
     decorated.__annotations__ = {p.name: p.annotation for p in parameters}
@@ -48,15 +49,16 @@ def given_options(arguments: dict[str, str | None]) -> dict[str, str]:
     return {name: text for name, text in arguments.items() if text is not None}
 
 
-def _make_option(name: str) -> inspect.Parameter:
+def _make_option(name: str, group: str) -> inspect.Parameter:
     field = FIELDS[name]
+    description = " ".join(str(field.description).split())
     default = ""
     if field.default not in (None, ()) and name != "cities":
         default = f" (default: {_format_default(field.default)})"
     option = typer.Option(
         f"--{_option_name(name)}",
-        help=f"{field.description}{default}",
-        rich_help_panel=argument_group(name),
+        help=f"{description}{default}",
+        rich_help_panel=group,
         metavar="BOOL" if name in BOOLEANS else "VALUE",
         show_default=False,
     )
