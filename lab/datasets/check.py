@@ -97,13 +97,8 @@ def inspect_dataset(
 ) -> DatasetReport:
     """Open all sets at or below a folder and collect their problems.
 
-    Args:
-        protocol: Protocol of the evaluation sets; None for their default.
-        rule: Positive-match criterion of the evaluation sets; None for their own.
-        min_photos: Training places with fewer photos are left out.
-
-    Raises:
-        NotFound: `no_data_set` if there is no set.
+    `protocol` and `rule` are those of the evaluation sets, None for their own. Training places with
+    fewer than `min_photos` are left out. Raises NotFound (`no_data_set`).
     """
     discovered = find_evaluation_sets(root)
     layout = find_training_layout(root)
@@ -243,11 +238,8 @@ def find_suspect_labels(
         min_score: Minimum score of a confident match; None for the median score of the first
             matches that are positives.
 
-    Returns:
-        Suspects, most confident first.
-
-    Raises:
-        InvalidRequest: `predictions_of_other_queries`.
+    Returns the suspects, most confident first. Raises InvalidRequest
+    (`predictions_of_other_queries`).
     """
     if len(ranked) != len(evaluation.queries) or (
         scores is not None and len(scores) != len(ranked)

@@ -84,14 +84,10 @@ def parse_rule(text: str) -> PositiveRule:
 def find_positives(
     rule: PositiveRule, queries: Sequence[DatasetPhoto], database: Sequence[DatasetPhoto]
 ) -> list[Indices]:
-    """Find the positives of each query in the database.
+    """Find the positives of each query: ascending indices into the database.
 
-    Returns:
-        Ascending database indices for each query.
-
-    Raises:
-        InvalidRequest: Photos lack what the rule needs: `no_positions`, `no_headings`, `no_frames`,
-            `no_places`.
+    Raises InvalidRequest if photos lack what the rule needs: `no_positions`, `no_headings`,
+    `no_frames`, `no_places`.
     """
     match rule.kind:
         case "radius":

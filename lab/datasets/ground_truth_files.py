@@ -54,15 +54,10 @@ def read_integer_lists(path: Path) -> list[Indices]:
 def read_numbered_ground_truth(
     path: Path, *, database: Sequence[str], queries: Sequence[str]
 ) -> list[Indices]:
-    """Read a ground truth of VPR-Bench: rows of a query's number and its database indices.
+    """Read a ground truth of VPR-Bench, (n, 2) objects: a query's number and its database indices.
 
-    Args:
-        path: The `.npy` file, an object array (n, 2).
-        database: Names of the database photos, in order.
-        queries: Names of the queries, in order; those without a row have no positives.
-
-    Raises:
-        InvalidRequest: `bad_ground_truth`, `ground_truth_of_other_lists`.
+    `database` and `queries` are the names of the photos, in order; queries without a row have no
+    positives. Raises InvalidRequest: `bad_ground_truth`, `ground_truth_of_other_lists`.
     """
     positives = [np.empty(0, np.int64) for _ in queries]
     with _refusing_bad_files(path):
@@ -153,11 +148,7 @@ def _row(value: Any, path: Path) -> Indices:
 
 
 def _unpickle(file: BinaryIO, shape: tuple[int, ...]) -> list[Any]:
-    """Unpickle an object array of the shape that its header declares; return its rows.
-
-    Instead of arrays and scalars, the restricted unpickler makes `_Array` and `_Scalar`. Raises
-    ValueError for another object or number of values.
-    """
+    """Unpickle an object array of the shape that its header declares; return its rows."""
     array = _Unpickler(file, encoding="latin1").load()
     if not isinstance(array, _Array) or array.fortran or len(shape) not in (1, 2):
         raise ValueError(f"it is not a list of lists; its shape is {shape}")
@@ -279,13 +270,9 @@ def write_ground_truth(
     queries: Sequence[str],
     rule: str,
 ) -> None:
-    """Write a ground truth and its sidecar with the rule and the fingerprints of the lists.
+    """Write a ground truth, `.npy`, and its sidecar with the rule and the lists' fingerprints.
 
-    Args:
-        path: The file; its suffix must be `.npy`.
-        positives: Database indices for each query.
-        database: Names of the database photos, in order.
-        queries: Names of the queries, in order.
+    `database` and `queries` are the names of the photos, in order.
     """
     write_integer_lists(path, positives)
     sidecar = _Sidecar(
@@ -299,18 +286,10 @@ def write_ground_truth(
 def read_ground_truth(
     path: Path, *, database: Sequence[str], queries: Sequence[str]
 ) -> tuple[list[Indices], str]:
-    """Read a ground truth and check that it belongs to these lists.
+    """Read a ground truth and check that it belongs to these lists of names, in their order.
 
-    Args:
-        path: The `.npy` file.
-        database: Names of the database photos, in order.
-        queries: Names of the queries, in order.
-
-    Returns:
-        The positives of each query, and the rule: that of the sidecar, or `given by gt.npy`.
-
-    Raises:
-        InvalidRequest: `bad_ground_truth`, `ground_truth_of_other_lists`.
+    Returns the positives of each query, and the rule: that of the sidecar, or `given by gt.npy`.
+    Raises InvalidRequest: `bad_ground_truth`, `ground_truth_of_other_lists`.
     """
     positives = read_integer_lists(path)
     rule = _check_sidecar(path, database, queries) or f"given by {path.name}"

@@ -175,16 +175,12 @@ class PhotoRow(TableRow):
 
 
 def read_photo_list(path: Path, folder: Path | None = None) -> tuple[DatasetPhoto, ...]:
-    """Read the photos of a list, in its order.
+    """Read the photos of a list, in its order: `.csv`, `.npy`, or text with a path a line.
 
-    Positions come from the columns of a CSV, from `@UTM@` file names, or from EXIF.
+    Positions come from the columns of a CSV, from `@UTM@` file names, or from EXIF. Paths are
+    relative to `folder`, by default the list's own.
 
-    Args:
-        path: The list: `.csv`, `.npy`, or any other suffix for one path per line.
-        folder: Folder that the paths are relative to; None for the list's own.
-
-    Raises:
-        InvalidRequest: `bad_list`, `bad_table`, `missing_column`, `bad_coordinates`.
+    Raises InvalidRequest: `bad_list`, `bad_table`, `missing_column`, `bad_coordinates`.
     """
     root = path.parent if folder is None else folder
     match path.suffix.lower():

@@ -84,18 +84,11 @@ def group_by_utm_plane(
 
     There is one plane for each grid of the queries; every query is in exactly one. A plane contains
     all database photos of its grid, and those of near grids, projected into it. If the photos have
-    at most one known grid, all photos are in one plane.
+    at most one known grid, all photos are in one plane. The arguments are those that
+    `utm_positions` returns.
 
-    Args:
-        queries: (n, 2) UTM metres and grids, from `utm_positions`.
-        database: the same of the database.
-
-    Yields:
-        For each plane: query indices, ascending database indices, (n, 2) metres of the queries and
-        (m, 2) metres of the database photos.
-
-    Raises:
-        InvalidRequest: `no_utm_zone` if there are several grids and some photos have none.
+    Yields query indices, ascending database indices, and the (n, 2) and (m, 2) metres of both.
+    Raises InvalidRequest (`no_utm_zone`) if there are several grids and some photos have none.
     """
     (query_metres, query_grids), (metres, grids) = queries, database
     known = {grid for grid in (*query_grids, *grids) if grid is not None}

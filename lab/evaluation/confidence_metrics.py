@@ -26,14 +26,8 @@ def recall_at_precision(
 ) -> float:
     """Compute the highest recall of any confidence threshold that has the required precision.
 
-    Args:
-        confidence: confidence of each query.
-        correct: whether each query's estimate is correct.
-        answerable: number of queries that can be answered correctly, the denominator of recall.
-        precision: minimum share of correct answers among those above the threshold.
-
-    Returns:
-        The recall, from 0 to 1; 0 if no threshold has the precision.
+    `answerable` queries can be answered correctly: the denominator of the recall, which is 0 if no
+    threshold has the precision.
     """
     order = np.argsort(-np.asarray(confidence, dtype=np.float64), kind="stable")
     predicted = np.asarray(confidence, dtype=np.float64)[order]

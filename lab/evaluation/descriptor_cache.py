@@ -40,16 +40,9 @@ class TimedDescriber(DescribeFunction, Protocol):
 class CachedDescriber:
     """DescribeFunction that calls `inner` only for photos whose descriptor is not cached.
 
-    Args:
-        inner: computes missing descriptors.
-        folder: folder of the cache files, shared by all specs.
-        spec: everything that determines a descriptor's value.
-        max_bytes: size limit of the folder. When it is reached, new descriptors are computed but
-            not stored.
-
-    Attributes:
-        on_lookup: called with the numbers of photos looked up so far and in total, before the
-            first descriptor is yielded.
+    `spec` is everything that determines a descriptor's value. When the folder has `max_bytes`, new
+    descriptors are computed but not stored. `on_lookup` is called with the numbers of photos looked
+    up so far and in total, before the first descriptor is yielded.
     """
 
     def __init__(

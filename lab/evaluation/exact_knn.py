@@ -48,17 +48,11 @@ def exact_knn(
 ) -> Rankings:
     """Search the k nearest database rows of each query by cosine similarity.
 
-    Args:
-        queries: (n, D) float32, L2-normalised; may be memory-mapped.
-        database: (m, D) float32, L2-normalised; may be memory-mapped.
-        block_bytes: size of the blocks of queries and of database rows.
-        on_progress: called with the numbers of finished and of all query-row comparisons.
+    `queries` are (n, D) and `database` (m, D) float32 L2-normalised rows, which may be mapped.
+    `on_progress` is called with the numbers of finished and of all comparisons.
 
-    Returns:
-        (n, min(k, m)) rankings; equally similar rows are ordered by index.
-
-    Raises:
-        Misconfigured: `faiss_gpu_missing`.
+    Returns (n, min(k, m)) rankings; equally similar rows are ordered by index. Raises
+    Misconfigured (`faiss_gpu_missing`).
     """
     search = _make_gpu_search() if faiss_gpu else _search_cpu
     k = min(k, len(database))

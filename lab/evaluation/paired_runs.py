@@ -43,13 +43,8 @@ def paired_differences(
 ) -> list[PairedDifference]:
     """Compute the paired difference of each metric between two runs on the same queries.
 
-    Args:
-        first: (queries, metrics) float64.
-        second: the same shape, in the same order.
-        clusters: (queries,) int64, the cluster label of each query.
-
-    Raises:
-        ValueError: the shapes differ.
+    `first` and `second` are (queries, metrics) float64, `clusters` the (queries,) cluster labels.
+    Raises ValueError if the shapes differ.
     """
     if first.shape != second.shape:
         raise ValueError(f"runs of different shape: {first.shape} and {second.shape}")

@@ -31,10 +31,7 @@ SEED = 0
 
 
 class _RowRanker:
-    """Ranks database photos by their similarity to one of them.
-
-    Photos without a ranking are collected and searched together: each search reads all rows.
-    """
+    """Ranks database photos by their similarity to one of them; searches many at once."""
 
     def __init__(self, rows: Rows) -> None:
         self._rows = rows
@@ -67,15 +64,10 @@ def measure_places(
     *,
     sampled_photos: int = SAMPLED_PHOTOS,
 ) -> dict[str, Any] | None:
-    """Fit the place model on the database photos and measure its answers to the queries.
+    """Fit the place model on `sampled_photos` database photos at most, and measure its answers.
 
-    Args:
-        evaluation_set: The data set.
-        database: (m, D) float32 unit descriptors of the database photos.
-        ranked: Database photos by query, best first, `EVIDENCE_DEPTH` of them if there are as many.
-        scheme: The levels.
-        position_radius_m: Radius of a place in metres.
-        sampled_photos: Maximum number of database photos that the model is fitted on.
+    `database` are the (m, D) float32 unit descriptors, `ranked` the database photos by query, best
+    first, `EVIDENCE_DEPTH` of them if there are as many; `position_radius_m` is that of a place.
 
     Returns:
         `source` of the model, number of `own_photos` and of queries (`samples`), `answers` at each

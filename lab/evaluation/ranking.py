@@ -46,16 +46,10 @@ def describe_to_matrix(
     *,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Iterator[Rows]:
-    """Describe photos into a matrix that is valid inside the `with` block.
+    """Describe photos into a (photos, D) float32 matrix that is valid inside the `with` block.
 
-    Args:
-        on_progress: called after each batch with the numbers of described and of all photos.
-
-    Yields:
-        (photos, D) float32 descriptors.
-
-    Raises:
-        Unprocessable: `features_not_finite`; also raises what `describe` raises.
+    `on_progress` is called with the numbers of described and of all photos. Raises what `describe`
+    raises, and Unprocessable (`features_not_finite`).
     """
     with contextlib.ExitStack() as stack:
         rows: Rows = np.empty((0, 0), np.float32)
@@ -153,11 +147,8 @@ def evaluate_recall(
 ) -> RecallEvaluation:
     """Describe the database and the queries, rank them exactly, and compute recall@k.
 
-    Args:
-        on_progress: called with the stage (`database`, `queries`, `search`), done and total.
-
-    Raises:
-        Misconfigured: `faiss_gpu_missing`; also raises what `describe` raises.
+    `on_progress` is called with the stage (`database`, `queries`, `search`), done and total. Raises
+    what `describe` and `exact_knn` raise.
     """
     described = describe_evaluation_set(describe, evaluation_set, on_progress=on_progress)
     with described as (database, queries):
@@ -181,10 +172,9 @@ def describe_evaluation_set(
     *,
     on_progress: ProgressCallback = lambda what, done, total: None,
 ) -> Iterator[tuple[Rows, Rows]]:
-    """Describe an evaluation set into matrices that are valid inside the `with` block.
+    """Describe a set into the (m, D) float32 descriptors of its database and (n, D) of its queries.
 
-    Yields:
-        (m, D) float32 descriptors of the database and (n, D) of the queries.
+    They are valid inside the `with` block.
     """
 
     def describe_photos(stage: str, photos: Sequence[DatasetPhoto]) -> AbstractContextManager[Rows]:
@@ -204,12 +194,7 @@ def describe_evaluation_set(
 def compute_recalls(
     ranked: Indices, positives: Sequence[Indices], ks: Sequence[int] = DEFAULT_KS
 ) -> Recalls:
-    """Compute both kinds of recall.
-
-    Args:
-        ranked: (queries, depth) database indices, best first.
-        positives: database indices of each query's positives.
-    """
+    """Compute both kinds of recall of (queries, depth) database indices, best first."""
     findable = [query for query, rows in enumerate(positives) if len(rows)]
     return Recalls(
         recall_all=recall_at_k(ranked, positives, ks),

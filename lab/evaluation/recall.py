@@ -21,17 +21,10 @@ Hits = NDArray[np.bool_]
 def positives_within(
     queries: Positions, database: Positions, within_m: float = POSITIVE_WITHIN_M
 ) -> list[Indices]:
-    """Find the database photos within a radius of each query.
+    """Return the ascending int64 indices of the database photos within a radius of each query.
 
+    `queries` are (n, 2) and `database` (m, 2) UTM metres of one zone; the radius is inclusive.
     Memory grows with the numbers of photos and positives, not with n times m.
-
-    Args:
-        queries: (n, 2) UTM easting and northing in metres.
-        database: (m, 2) UTM easting and northing in metres, in the same zone.
-        within_m: radius in metres, inclusive.
-
-    Returns:
-        For each query the indices of its positives, int64, ascending.
     """
     if not len(database):
         return [np.empty(0, np.int64) for _ in queries]
@@ -62,18 +55,10 @@ def compute_hits(ranked: Indices, positives: Sequence[Indices]) -> Hits:
 def recall_at_k(
     ranked: Indices, positives: Sequence[Indices], ks: Sequence[int] = (1, 5, 10)
 ) -> dict[int, float]:
-    """Compute recall@k: the share of queries with a positive among their first k.
+    """Compute recall@k, from 0 to 1: the share of queries with a positive among their first k.
 
-    Args:
-        ranked: (queries, depth) database indices, best first.
-        positives: database indices of each query's positives. A query without positives counts as
-            a miss; filter such queries beforehand to exclude them.
-
-    Returns:
-        k -> recall from 0 to 1; NaN without queries.
-
-    Raises:
-        ValueError: the numbers of rankings and queries differ.
+    `ranked` are (queries, depth) database indices, best first. A query without positives counts as
+    a miss. NaN without queries; ValueError if the numbers of rankings and queries differ.
     """
     if len(ranked) != len(positives):
         raise ValueError(f"{len(ranked)} rankings for {len(positives)} queries")

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lab.datasets.check import SuspectLabel
 from lab.datasets.dataset import DatasetPhoto, EvaluationSet
@@ -28,15 +29,25 @@ from lab.evaluation.retrieval_metrics import RetrievalMetrics, hits_at_k
 from shared.errors import Conflict, InvalidRequest, NotFound
 
 
+def load_matrix(path: Path, kinds: str, code: str, expected: str) -> NDArray[Any]:
+    """Map the matrix of an `.npy` file, with numbers of these kinds (`np.dtype.kind`).
+
+    Raises InvalidRequest with the code `code`; the message says what is `expected`.
+    """
+    try:
+        matrix: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InvalidRequest(code, f"Can't read {path}: {error}.") from error
+    if not isinstance(matrix, np.ndarray) or matrix.ndim != 2 or matrix.dtype.kind not in kinds:
+        raise InvalidRequest(code, f"{path} must contain {expected}.")
+    return matrix
+
+
 def read_predictions(path: Path) -> Indices:
-    """Read predictions from an `.npy` file.
+    """Read (queries, k) int64 database indices, best first, from an `.npy` file.
 
-    Returns:
-        (queries, k) int64 database indices, best first.
-
-    Raises:
-        InvalidRequest: `predictions_unreadable`, `predictions_empty`, or `bad_predictions` (not a
-            two-dimensional integer array, or a negative index).
+    Raises InvalidRequest: `predictions_unreadable`, `predictions_empty`, or `bad_predictions` (not
+    a two-dimensional integer array, or a negative index).
     """
     try:
         stored = np.load(path, allow_pickle=False)
@@ -71,16 +82,9 @@ def predictions_path(folder: Path, set_name: str) -> Path:
 def check_predictions(
     path: Path, ranked: Indices, positives: Sequence[Indices], database_size: int | None
 ) -> None:
-    """Check that predictions match the queries and the database.
+    """Check that predictions match the queries and the database; its size may be unknown.
 
-    Args:
-        path: the file, for error messages.
-        ranked: (queries, k) database indices.
-        positives: the ground truth, one entry per query.
-        database_size: number of database photos; None if unknown.
-
-    Raises:
-        InvalidRequest: `predictions_of_other_queries`, `bad_predictions`.
+    Raises InvalidRequest: `predictions_of_other_queries`, `bad_predictions`.
     """
     if len(ranked) != len(positives):
         raise InvalidRequest(
@@ -129,19 +133,9 @@ class RunComparison:
 
 
 def compare_with_run(
-    folder: Path,
-    set_name: str,
-    fingerprint: str,
-    measured: RetrievalMetrics,
-    positives: Sequence[Indices],
+    folder: Path, evaluation_set: EvaluationSet, measured: RetrievalMetrics
 ) -> RunComparison:
-    """Compare this run with an earlier `--out` folder, query by query.
-
-    Args:
-        folder: the earlier run's output folder.
-        fingerprint: the set's fingerprint in this run.
-        measured: this run's metrics.
-        positives: database indices of each query's positives.
+    """Compare this run with an earlier one, given by its `--out` folder, query by query.
 
     Raises:
         NotFound: `no_run`.
@@ -149,6 +143,8 @@ def compare_with_run(
         Conflict: `runs_not_comparable`, if the set, its queries or the protocol differ.
     """
     stored = _load_metrics(folder)
+    set_name, positives = evaluation_set.name, evaluation_set.positives
+    fingerprint = evaluation_set.fingerprint
     other_set = stored.get("sets", {}).get(set_name)
     if other_set is None:
         raise NotFound(

@@ -38,18 +38,12 @@ def hits_at_k(hits: Hits, ks: Sequence[int]) -> NDArray[np.float64]:
 
 
 def average_precisions(hits: Hits, positive_counts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Compute the average precision at k of each query.
+    """Compute the average precision at k of each query, (queries,) float64, of (queries, k) hits.
 
     AP@k is the sum of the precisions at the ranks of the positives among the first k, divided by
     min(positives, k). It is 1 if no wrong photo is ranked above a positive (Manning et al.,
-    Introduction to Information Retrieval, 8.4, truncated at k).
-
-    Args:
-        hits: (queries, k) bool.
-        positive_counts: (queries,) number of positives of each query.
-
-    Returns:
-        (queries,) float64; NaN for a query without positives, to be excluded from the mean.
+    Introduction to Information Retrieval, 8.4, truncated at k). NaN for a query without positives,
+    to be excluded from the mean.
     """
     ranks = np.arange(1, hits.shape[1] + 1)
     precision = np.cumsum(hits, axis=1) / ranks
@@ -80,17 +74,10 @@ class PrecisionRecall:
 def precision_recall(
     scores: NDArray[np.floating], correct: NDArray[np.bool_], queries_with_positive: int
 ) -> PrecisionRecall | None:
-    """Compute the precision-recall curve of the first match over score thresholds.
+    """Compute the precision-recall curve of the (queries,) first matches over score thresholds.
 
-    Queries without a positive are included: accepting their first match lowers precision.
-
-    Args:
-        scores: (queries,) score of the first match.
-        correct: (queries,) whether the first match is a positive.
-        queries_with_positive: number of queries with a positive.
-
-    Returns:
-        The curve; None without a query that has a positive.
+    Queries without a positive are included: accepting their first match lowers precision. None
+    without a query that has a positive.
     """
     if not queries_with_positive or not len(scores):
         return None
@@ -111,13 +98,9 @@ Distances = NDArray[np.float64]
 def match_distances(
     queries: Sequence[DatasetPhoto], database: Sequence[DatasetPhoto], ranked: Indices
 ) -> Distances:
-    """Compute the distance of each ranked photo from its query.
+    """Compute the distance of each of the (queries, k) ranked photos from its query, in metres.
 
-    Args:
-        ranked: (queries, k) database indices.
-
-    Returns:
-        (queries, k) metres; NaN where a photo has no position.
+    NaN where a photo has no position.
     """
     repeated = [query for query, row in zip(queries, ranked, strict=True) for _ in row]
     matches = [database[index] for index in ranked.ravel().tolist()]
@@ -128,13 +111,9 @@ DISTANCE_THRESHOLDS_M = (1, 2, 5, 10, 15, 20, 25, 30, 40, 50, 75, 100, 200, 500,
 
 
 def distance_error(metres: NDArray[np.float64]) -> dict[str, Any] | None:
-    """Summarise the distances of first matches: median, and shares within given distances.
+    """Summarise the (queries,) metres of first matches, NaN if unknown; None if all are.
 
-    Args:
-        metres: (queries,) distance of the first match; NaN if unknown.
-
-    Returns:
-        `queries`, `without_position`, `median_m` and `within`; None if no distance is known.
+    Returns `queries`, `without_position`, `median_m`, and the shares `within` given distances.
     """
     known = metres[np.isfinite(metres)]
     if not len(known):
@@ -175,13 +154,9 @@ def calibrate_scores(
     queries_with_positive: int,
     clusters: QueryClusters,
 ) -> ScoreCalibration:
-    """Measure how well the score of the first match predicts that it is correct.
+    """Measure how well the (queries,) cosines of the first matches predict that they are correct.
 
-    Args:
-        scores: (queries,) cosine of the first match.
-        correct: (queries,) whether the first match is a positive.
-        queries_with_positive: number of queries with a positive.
-        clusters: clusters of correlated queries; a cluster is never split between folds.
+    A cluster is never split between the folds of the cross-validation.
     """
     values, target = scores.astype(np.float64).tolist(), correct.tolist()
     confidence = _cross_validated_confidence(scores.astype(np.float64), correct, clusters)
@@ -199,10 +174,7 @@ def calibrate_scores(
 def _cross_validated_confidence(
     scores: NDArray[np.float64], correct: NDArray[np.bool_], clusters: QueryClusters
 ) -> list[float] | None:
-    """Predict P(correct) of each query by cross-validation, without splitting clusters.
-
-    The model is a logistic regression on the score (Platt 1999).
-    """
+    """Predict P(correct) by a logistic regression on the score (Platt 1999), cross-validated."""
     fold = np.random.default_rng(0).permutation(int(clusters.labels.max(initial=-1)) + 1) % FOLDS
     folds = fold[clusters.labels] if len(scores) else np.empty(0, np.int64)
     predictions = np.zeros(len(scores))
@@ -299,8 +271,7 @@ def compute_metrics(
         ranked: (queries, depth) database indices, best first.
         positives: database indices of each query's positives.
         clusters: clusters of correlated queries, for the intervals.
-        scores: (queries, depth) cosines; None (a predictions file) omits the precision-recall
-            curve and the calibration.
+        scores: (queries, depth) cosines; None omits the precision-recall curve and the calibration.
         metres: (queries, depth) distances from the query; None omits the distance error.
         ks: the values of k; those beyond the depth are ignored.
     """

@@ -29,16 +29,13 @@ HMM_JUMP = 0.01
 def seqslam_matches(
     scores: NDArray[np.float32], positions: FloatArray, step: float, cell: float
 ) -> Indices:
-    """Match the frames of a sequence.
+    """Match the frames of a sequence to photos; returns their (frames,) numbers.
 
     Args:
         scores: (frames, n) similarities of the frames to the map's photos.
         positions: (n, 1) places along the map's sequence, or (n, 2) metres.
         step: Distance between two frames at the typical speed, in the unit of `positions`.
         cell: Photos within a cell of this side are at the same position.
-
-    Returns:
-        (frames,) the photo that each frame matches.
     """
     standardised = _standardise(scores)
     cells, cell_of = np.unique(
@@ -74,16 +71,9 @@ def seqslam_matches(
 def hmm_matches(scores: NDArray[np.float32], positions: FloatArray, reach: float) -> Indices:
     """Match the frames of a sequence by the forward pass of a hidden Markov model.
 
-    Between two frames the camera moves to any photo within reach with the same probability, or with
-    HMM_JUMP to any other. The likelihood of a photo is exp(standardised score).
-
-    Args:
-        scores: (frames, n) similarities of the frames to the map's photos.
-        positions: (n, 1) places along the map's sequence, or (n, 2) metres.
-        reach: Of a camera between two frames, in the unit of `positions`.
-
-    Returns:
-        (frames,) the photo that each frame matches.
+    Between two frames the camera moves to any photo within `reach` with the same probability, or
+    with HMM_JUMP to any other. The likelihood of a photo is exp(standardised score). The arguments
+    are those of `seqslam_matches`.
     """
     count = len(positions)
     pairs = cKDTree(positions).query_pairs(reach, output_type="ndarray")

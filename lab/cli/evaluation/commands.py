@@ -11,7 +11,7 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -22,6 +22,15 @@ from shared.errors import InvalidRequest
 from shared.tracks.motion import parse_motion
 
 OptionValues = dict[str, object]
+
+
+def _existing_file(help_text: str) -> Any:
+    return typer.Option(exists=True, dir_okay=False, help=help_text)
+
+
+def _existing_folder(help_text: str) -> Any:
+    return typer.Option(exists=True, file_okay=False, help=help_text)
+
 
 ProtocolOption = Annotated[
     str | None, typer.Option(help="Evaluation protocol, such as msls-official or vme.")
@@ -60,11 +69,9 @@ class ReportOptions:
 def evaluate(
     data: Annotated[
         Path | None,
-        typer.Option(
-            exists=True,
-            file_okay=False,
-            help="Evaluate on a data set (see `datasets check`) instead of a live map. "
-            "With --ground-truth: root folder of the listed photos.",
+        _existing_folder(
+            "Evaluate on a data set (see `datasets check`) instead of a live map. "
+            "With --ground-truth: root folder of the listed photos."
         ),
     ] = None,
     sets: Annotated[
@@ -74,12 +81,7 @@ def evaluate(
     protocol: ProtocolOption = None,
     rule: RuleOption = None,
     checkpoint: Annotated[
-        Path | None,
-        typer.Option(
-            exists=True,
-            dir_okay=False,
-            help="Checkpoint of a trained or published network to evaluate.",
-        ),
+        Path | None, _existing_file("Checkpoint of a trained or published network to evaluate.")
     ] = None,
     image_size: Annotated[
         str,
@@ -88,14 +90,10 @@ def evaluate(
         ),
     ] = "same",
     extractor: Annotated[
-        str | None,
-        typer.Option(help="Extractor to evaluate, with options as in EXTRACTOR."),
+        str | None, typer.Option(help="Extractor to evaluate, with options as in EXTRACTOR.")
     ] = None,
     vocabulary: Annotated[
-        Path | None,
-        typer.Option(
-            exists=True, dir_okay=False, help="VLAD vocabulary: .npz, .npy or c_centers.pt."
-        ),
+        Path | None, _existing_file("VLAD vocabulary: .npz, .npy or c_centers.pt.")
     ] = None,
     fit_vocabulary: Annotated[
         bool,
@@ -115,45 +113,25 @@ def evaluate(
         ),
     ] = None,
     predictions: Annotated[
-        Path | None,
-        typer.Option(
-            exists=True,
-            dir_okay=False,
-            help="Evaluate predictions: (queries, k) database indices, .npy.",
-        ),
+        Path | None, _existing_file("Evaluate predictions: (queries, k) database indices, .npy.")
     ] = None,
     ground_truth: Annotated[
         Path | None,
-        typer.Option(
-            exists=True,
-            dir_okay=False,
-            help="Ground truth of --predictions, or of the one --set of --data, .npy. If omitted: "
-            "that of --data and --set.",
+        _existing_file(
+            "Ground truth of --predictions, or of the one --set of --data, .npy. If omitted: "
+            "that of --data and --set."
         ),
     ] = None,
     database: Annotated[
-        Path | None,
-        typer.Option(
-            exists=True,
-            dir_okay=False,
-            help="With --predictions: names of database photos, .npy or text.",
-        ),
+        Path | None, _existing_file("With --predictions: names of database photos, .npy or text.")
     ] = None,
-    queries: Annotated[
-        Path | None,
-        typer.Option(exists=True, dir_okay=False, help="With --predictions: names of queries."),
-    ] = None,
+    queries: Annotated[Path | None, _existing_file("With --predictions: names of queries.")] = None,
     out: Annotated[
         Path | None,
         typer.Option(help="Output folder for predictions, metrics.json and report.html."),
     ] = None,
     against: Annotated[
-        Path | None,
-        typer.Option(
-            exists=True,
-            file_okay=False,
-            help="Compare with another run, given by its --out folder.",
-        ),
+        Path | None, _existing_folder("Compare with another run, given by its --out folder.")
     ] = None,
     pairs: Annotated[
         Path | None,
@@ -163,8 +141,7 @@ def evaluate(
         int, typer.Option(min=1, max=1000, help="Number of database photos ranked per query.")
     ] = 20,
     recall_at: Annotated[
-        str | None,
-        typer.Option(help="Values of k of the reported recalls. Default: 1,5,10,20."),
+        str | None, typer.Option(help="Values of k of the reported recalls. Default: 1,5,10,20.")
     ] = None,
     grids: Annotated[
         int,

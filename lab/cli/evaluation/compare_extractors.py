@@ -57,17 +57,10 @@ def whiten_set(
     device: str,
     on_progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> tuple[Rows, Rows, float]:
-    """Fit a PCA whitening on the database rows and project the rows of a data set.
+    """Fit a PCA whitening on the (m, D) database rows, and project them and the (n, D) query rows.
 
-    Args:
-        database: (m, D) rows.
-        queries: (n, D) rows.
-
-    Returns:
-        (m, components) and (n, components) rows, and the milliseconds to project one row.
-
-    Raises:
-        Unprocessable: `pca_too_few_rows`, `pca_too_many_dimensions`.
+    Returns (m, components) and (n, components) rows, and the milliseconds to project one row.
+    Raises Unprocessable: `pca_too_few_rows`, `pca_too_many_dimensions`.
     """
     dimension = database.shape[1]
     check_pca_fittable(len(database), dimension, components)
@@ -108,8 +101,7 @@ class ComparisonEntry:
 def parse_entries(text: str) -> list[ComparisonEntry]:
     """Parse `--extractors`: `a,b:layer=9,facet=key+pca512,run.ckpt` gives three entries.
 
-    Raises:
-        InvalidRequest: `bad_extractors`.
+    Raises InvalidRequest: `bad_extractors`.
     """
     parts: list[str] = []
     for part in text.split(","):
@@ -156,10 +148,8 @@ def compare_extractors(
 ) -> None:
     """Evaluate each extractor on a data set, then print and write the comparison.
 
-    Raises:
-        InvalidRequest: `bad_extractors`, and errors of opening the data set.
-        Misconfigured: `out_unwritable`, and errors of loading the extractors.
-        Unprocessable: A photo can't be described.
+    Raises InvalidRequest (`bad_extractors`), Misconfigured (`out_unwritable`), Unprocessable (a
+    photo can't be described), and errors of opening the data set and loading the extractors.
     """
     entries = parse_entries(extractors)
     settings = read_settings()

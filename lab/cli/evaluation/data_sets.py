@@ -35,7 +35,7 @@ from lab.evaluation.ranking import (
     describe_to_matrix,
     refused_photos_error,
 )
-from lab.evaluation.results import EvaluationResult, EvaluationRun
+from lab.evaluation.results import EvaluationResult, EvaluationRun, load_matrix
 from placewise.answers import Similar, Uploaded
 from placewise.client import Client
 from services.cli.client import active_generation, connect
@@ -60,19 +60,8 @@ def _evaluate_server(
 ) -> tuple[Rankings, EvaluationRun, dict[str, Any]]:
     """Rank the database photos for each query through a server's HTTP API.
 
-    Uploads are idempotent: a repeated evaluation describes no photo twice. No positions are sent,
-    so that results depend on image content only.
-
-    The map, by default one named after the set, is created if it does not exist. It must not
-    contain other photos.
-
-    Returns:
-        The rankings, the description of the run, and the descriptor dimension with the median
-        latency of a query in milliseconds.
-
-    Raises:
-        Conflict: `map_holds_others`.
-        Unavailable: `answer_short` if the server returns fewer results than requested.
+    The map, by default one named after the set, is created if it does not exist. A repeated
+    evaluation describes no photo twice. No positions are sent: results depend on the images only.
     """
     set_name = re.sub(r"[^a-z0-9]+", "-", evaluation_set.name.lower()).strip("-")
     name = target.map_name or f"evaluate-{set_name}"
@@ -119,10 +108,7 @@ def _evaluate_server(
 def _upload_database(
     client: Client, evaluation_set: EvaluationSet, name: str, progress: Progress
 ) -> dict[UUID, list[int]]:
-    """Upload the database photos; returns the database indices by file ID.
-
-    Photos with equal bytes share a file ID.
-    """
+    """Upload the database photos; returns the database indices by file id, the same for twins."""
     bar = progress.add_task(f"{evaluation_set.name}: uploading", total=len(evaluation_set.database))
 
     def upload(index: int) -> Uploaded:
@@ -207,8 +193,7 @@ class EvaluationTarget:
     def check(self) -> None:
         """Check that exactly one target is given.
 
-        Raises:
-            InvalidRequest: `options_contradict`, `no_model`.
+        Raises InvalidRequest: `options_contradict`, `no_model`.
         """
         if len([one for one in (self.checkpoint, self.extractor, self.rows) if one]) > 1:
             raise InvalidRequest(
@@ -241,13 +226,10 @@ def evaluate_sets(
 ) -> None:
     """Evaluate a target on the named sets below `data`, or on all of them.
 
-    `ground_truth`: a file that replaces the ground truth of the only set, or None.
+    `ground_truth` is a file that replaces the ground truth of the only set, or None.
 
-    Raises:
-        NotFound: `no_evaluation_set`.
-        InvalidRequest: `options_contradict`, `no_model`, `which_set`, and errors of opening the
-            sets.
-        Misconfigured: `out_unwritable`, and errors of loading the model.
+    Raises NotFound (`no_evaluation_set`), InvalidRequest (`options_contradict`, `no_model`,
+    `which_set`), Misconfigured (`out_unwritable`), and errors of opening sets and models.
     """
     target.check()
     described = target.checkpoint or target.extractor or target.rows
@@ -386,20 +368,12 @@ ROWS_BLOCK_BYTES = 64_000_000  # size of the float32 rows that are read at once
 def _open_rows(
     evaluation_set: EvaluationSet, files: tuple[Path, Path]
 ) -> Iterator[tuple[Rows, Rows]]:
-    """Read the descriptors of a set into matrices that are valid inside the `with` block.
-
-    Yields:
-        (m, D) float32 L2-normalised rows of the database and (n, D) of the queries.
-
-    Raises:
-        InvalidRequest: `bad_rows` if a file is not a 2-D array of finite numbers with a row other
-            than zero for each photo, or if their widths differ.
-    """
+    """Read a set's descriptors into L2-normalised matrices, valid inside the `with` block."""
     with contextlib.ExitStack() as stack:
         matrices: list[Rows] = []
         for file, role in zip(files, ("database", "queries"), strict=True):
             photos = getattr(evaluation_set, role)
-            rows = _load_rows(file)
+            rows = load_matrix(file, "fiu", "bad_rows", "a (photos, D) array of numbers")
             if len(rows) != len(photos):
                 raise InvalidRequest(
                     "bad_rows",
@@ -417,16 +391,6 @@ def _open_rows(
                 f"{files[0]} has {database.shape[1]} columns and {files[1]} {queries.shape[1]}.",
             )
         yield database, queries
-
-
-def _load_rows(file: Path) -> NDArray[Any]:
-    try:
-        rows: NDArray[Any] = np.load(file, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InvalidRequest("bad_rows", f"Can't read {file}: {error}.") from error
-    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.dtype.kind not in "fiu":
-        raise InvalidRequest("bad_rows", f"{file} must contain a (photos, D) array of numbers.")
-    return rows
 
 
 def _normalised_blocks(file: Path, rows: NDArray[Any], photos: Sequence[Path]) -> Iterator[Rows]:

@@ -67,11 +67,7 @@ class ExtractorDescriber:
         self.photos = 0
 
     def __call__(self, photos: Sequence[Path]) -> Iterator[Rows]:
-        """Yield (b, D) batches in the order of the photos.
-
-        Raises:
-            Unprocessable: `photos_refused`, which lists every photo that can't be described.
-        """
+        """Yield (b, D) batches in the order of the photos, then raise an error of those refused."""
         refused: list[tuple[Path, PlacewiseError]] = []
         for rows in describe_photos(
             photos, self._extractor, self._centres, self._settings, refused, self._seconds

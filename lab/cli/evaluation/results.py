@@ -10,7 +10,7 @@ import numpy as np
 from rich.table import Column
 
 from lab.cli.evaluation.commands import ReportOptions
-from lab.datasets.check import find_suspect_labels
+from lab.datasets.check import SuspectLabel, find_suspect_labels
 from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.datasets.ground_truth_files import read_ground_truth, read_integer_lists
 from lab.datasets.photo_lists import read_photo_list
@@ -47,8 +47,7 @@ from shared.evaluation.bootstrap import ConfidenceInterval
 def check_output_folders(options: ReportOptions) -> None:
     """Create the output folders before the long computation of results.
 
-    Raises:
-        Misconfigured: `out_unwritable`.
+    Raises Misconfigured: `out_unwritable`.
     """
     if options.out is not None:
         with refuse_unwritable(options.out):
@@ -69,55 +68,30 @@ def evaluate_rankings(
 ) -> EvaluationResult:
     """Compute all metrics of one set, and the comparison with an earlier run, if requested.
 
-    Args:
-        evaluation_set: The set. `database` is empty if its photos are unknown; each query is then
-            a cluster of its own, and no distances are reported.
-        ranked: Database indices and scores per query, best first.
-        options: Output options.
-        has_scores: Whether the scores of `ranked` are meaningful.
-        about: Further figures to report, such as the descriptor dimension.
-        places: Answers at the levels of places (`measure_places`), if they were measured.
+    Without a database, whose photos are unknown then, each query is a cluster of its own, and no
+    distances are reported. Without `has_scores` the scores of `ranked` mean nothing. `about` are
+    further figures to report, `places` those of `measure_places`.
     """
+    queries, database = evaluation_set.queries, evaluation_set.database
+    scores = ranked.scores if has_scores else None
+    clusters, metres, suspects = singleton_clusters(len(queries)), None, list[SuspectLabel]()
+    if database:
+        clusters = cluster_queries(queries)
+        metres = match_distances(queries, database, ranked.indices)
+        suspects = find_suspect_labels(evaluation_set, ranked.indices, scores)
     measured = compute_metrics(
         ranked.indices,
         evaluation_set.positives,
-        cluster_queries(evaluation_set.queries)
-        if evaluation_set.database
-        else singleton_clusters(len(evaluation_set.queries)),
-        scores=ranked.scores if has_scores else None,
-        metres=(
-            match_distances(evaluation_set.queries, evaluation_set.database, ranked.indices)
-            if evaluation_set.database
-            else None
-        ),
+        clusters,
+        scores=scores,
+        metres=metres,
         ks=options.ks or DEFAULT_KS,
     )
     against = None
     if options.against is not None:
-        against = compare_with_run(
-            options.against,
-            evaluation_set.name,
-            evaluation_set.fingerprint,
-            measured,
-            evaluation_set.positives,
-        )
+        against = compare_with_run(options.against, evaluation_set, measured)
     return EvaluationResult(
-        evaluation_set,
-        ranked,
-        has_scores,
-        measured,
-        about,
-        against=against,
-        suspects=(
-            tuple(
-                find_suspect_labels(
-                    evaluation_set, ranked.indices, ranked.scores if has_scores else None
-                )
-            )
-            if evaluation_set.database
-            else ()
-        ),
-        places=places,
+        evaluation_set, ranked, has_scores, measured, about, against, tuple(suspects), places
     )
 
 
@@ -126,8 +100,7 @@ def output_results(
 ) -> None:
     """Write the requested files and print the metrics.
 
-    Raises:
-        Misconfigured: `out_unwritable`.
+    Raises Misconfigured: `out_unwritable`.
     """
     if options.out is not None:
         with refuse_unwritable(options.out):
@@ -234,18 +207,10 @@ def read_evaluation_set(
     photos: Path | None,
     name: str | None,
 ) -> EvaluationSet:
-    """Make an evaluation set of a ground truth file and lists of photos.
+    """Make an evaluation set of a ground truth file and lists of photos, relative to `photos`.
 
-    Args:
-        ground_truth: The positives of each query, `.npy`.
-        database: List of the database photos' names, or None.
-        queries: List of the queries' names, or None. Without lists, queries are numbered, and the
-            set has no database.
-        photos: Root folder of the names; None for the folder of each list.
-        name: Name of the set; None for that of the file.
-
-    Raises:
-        InvalidRequest: `one_list`, and errors of reading the files.
+    Without lists, queries are numbered, and the set has no database. Raises InvalidRequest
+    (`one_list`), and errors of reading the files.
     """
     rule = f"given by {ground_truth.name}"
     of_database: tuple[DatasetPhoto, ...] = ()

@@ -62,9 +62,8 @@ def evaluate_sequences(
 
     With `kidnap_every`, the camera is also carried away after every so many frames.
 
-    Raises:
-        NotFound: `no_evaluation_set`, `no_sequences`.
-        InvalidRequest: `options_contradict`, `no_model`, and errors of opening the sets.
+    Raises NotFound (`no_evaluation_set`, `no_sequences`), InvalidRequest (`options_contradict`,
+    `no_model`), and errors of opening the sets.
     """
     target.check()
     if target.checkpoint is None and target.extractor is None:

@@ -76,11 +76,7 @@ class TrainingLayout(ABC):
     def open(self, base: Path, cities: Sequence[str] | None, min_photos: int) -> TrainingSet:
         """Open the places with at least `min_photos` photos of the given cities, or of all.
 
-        Places are sorted by city, in the given order, and by id. The i-th city's ids are offset by
-        `i * PLACE_ID_STEP`. If any id is not below PLACE_ID_STEP, the step is the next power of ten
-        above the largest id.
-
-        Raises NotFound (`city_missing`).
+        They are sorted by city, in the given order, and by id. Raises NotFound (`city_missing`).
         """
         available = self.cities(base)
         known = {city.lower(): city for city in available}

@@ -33,10 +33,7 @@ def percent_chart(
 ) -> tuple[Figure, Axes]:
     """Create a chart with a y axis from 0 to 100 %.
 
-    Args:
-        y_label: label of the y axis, whose values are from 0 to 1.
-        x_ticks: ticks of the x axis, from its first to its last value. None: from 0 to 100 %.
-        log: logarithmic x axis.
+    `x_ticks` run from the first to the last value of the x axis; None: from 0 to 100 %.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import PercentFormatter
@@ -100,8 +97,7 @@ def precision_chart(result: EvaluationResult) -> Markup | None:
 def reliability_chart(levels: Sequence[dict[str, Any]]) -> Markup:
     """Render the observed share of right answers over the stated probability, a line a level.
 
-    Args:
-        levels: Figures of each level (`reliability_figures`), finest first.
+    `levels` are the figures of each level (`reliability_figures`), finest first.
     """
     figure, axes = percent_chart("stated probability", "observed share")
     axes.plot([0, 1], [0, 1], "--", color=GREY)
@@ -142,11 +138,7 @@ MAX_QUERY_POINTS = 2000
 
 
 def positions_chart(result: EvaluationResult) -> tuple[Markup, str] | None:
-    """Render a map of the queries and their first matches, in UTM metres.
-
-    Returns:
-        The `<img>` and a caption that says how many queries are shown; None without positions.
-    """
+    """Render a map of queries and first matches, and its caption; None without positions."""
     zone = _most_common_zone(result.evaluation_set.queries)
     database = _utm_positions(result.evaluation_set.database, zone)
     queries = _utm_positions(result.evaluation_set.queries, zone)

@@ -197,16 +197,6 @@ def test_only_wrong_leaves_right_queries_out_of_the_report(city: Path, tmp_path:
     assert page.framed.count("query") == round(6 * (1 - recall))
 
 
-def test_second_run_describes_nothing_again(city: Path, tmp_path: Path) -> None:
-    given = ["evaluate", "--data", city, "--extractor", "test-tiny-avg"]
-    before = run_json(*given, "--out", tmp_path / "before")
-    after = run_json(*given, "--against", tmp_path / "before")
-    assert after["recall"] == before["recall"]
-    # The mean of all times that were ever measured for these descriptors
-    assert after["describe_ms_a_photo"] == before["describe_ms_a_photo"]
-    assert (after["against"]["won"], after["against"]["lost"]) == ([], [])
-
-
 def test_checkpoint_is_evaluated_at_the_size_it_was_trained_for(
     city: Path, town: EvaluationSet, checkpoint: Path
 ) -> None:
