@@ -9,7 +9,6 @@ that a user would get. They are of a generated city and are not comparable with 
 
 from __future__ import annotations
 
-import argparse
 import os
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,6 +17,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
+import typer
 from PIL import Image, ImageDraw, ImageFont
 
 from lab.city.plan import CityOptions, make_plan
@@ -94,10 +94,7 @@ CORRECT_COLOUR, WRONG_COLOUR, OUT_OF_MAP_COLOUR = (46, 160, 67), (207, 60, 50), 
 
 
 def _draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path) -> None:
-    """Write a JPEG with queries in the upper rows and the most similar photo below each of them.
-
-    The frame is green for a correct match, red for a wrong one, grey for "not in this map".
-    """
+    """Write a JPEG of queries, each above its best match in the colour of the answer."""
     chosen = _choose_outcomes(outcomes)
     width = COLUMNS * (CELL[0] + GAP) + GAP
     block = 2 * CELL[1] + 2 * CAPTION + 2 * GAP
@@ -148,50 +145,35 @@ def _paste(sheet: Image.Image, path: Path, left: int, top: int) -> None:
         sheet.paste(photo.convert("RGB").resize(CELL, Image.Resampling.BICUBIC), (left, top))
 
 
-def main() -> None:
+def main(
+    places: int = 300,
+    views: int = 3,
+    queries: int = 400,
+    out_of_map: float = 0.2,
+    seed: int = 0,
+    picture: Path | None = None,
+) -> None:
+    """Index and query a generated city; half of the queries are labelled.
+
+    `views` are the database photos of a place, `out_of_map` is the share of the queries outside the
+    map, and `picture` the JPEG file of queries and matches to write.
+    """
     # As the command does before torch is loaded; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    options = _parse_arguments()
     with tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
         os.environ["PLACEWISE_HOME"] = str(Path(folder, "home"))
         os.environ["AUTO_EVALUATE_PHOTOS"] = "0"  # the demo starts its evaluations itself
         city = Path(folder, "city")
-        plan = make_plan(
-            CityOptions(
-                options.places,
-                options.views,
-                options.queries,
-                options.seed,
-                0,
-                options.out_of_map,
-                320,
-                240,
-                train=False,
-            )
-        )
+        options = CityOptions(places, views, queries, seed, 0, out_of_map, 320, 240, train=False)
+        plan = make_plan(options)
         bar = progress.add_task("rendering", total=len(plan.photos))
         write_city(plan, city, lambda count: progress.advance(bar, count))
         with connect(None, None) as client:
             outcomes = _run_demo(client, city, progress)
         _print_outcomes(outcomes)
-        if options.picture:
-            _draw_outcomes(outcomes, city / "database", options.picture)
-            print(f"Queries and their matches: {options.picture}")
-
-
-def _parse_arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Index and query a generated city.")
-    parser.add_argument("--places", type=int, default=300)
-    parser.add_argument("--views", type=int, default=3, help="database photos per place")
-    parser.add_argument(
-        "--queries", type=int, default=400, help="number of queries, half of them labelled"
-    )
-    parser.add_argument(
-        "--out-of-map", type=float, default=0.2, help="share of queries outside the map"
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--picture", type=Path, help="JPEG file of queries and matches to write")
-    return parser.parse_args()
+        if picture:
+            _draw_outcomes(outcomes, city / "database", picture)
+            print(f"Queries and their matches: {picture}")
 
 
 def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutcome]:
@@ -240,4 +222,4 @@ def _share(counts: Iterable[bool]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -17,9 +17,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Annotated, Any, Self
 from uuid import UUID
 
@@ -49,30 +47,36 @@ CLOCK_OFFSETS_SECONDS = {
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A fault of the suite.
-
-    `inject(fleet, seconds)` is a context manager that breaks a component on entry and repairs it on
-    exit. Faults that have a duration last `seconds`.
-    """
+    """A fault of the suite: `begin` breaks a component, and `end` repairs it."""
 
     name: str
-    inject: Callable[[Fleet, float], AbstractContextManager[None]]
+    begin: Callable[[Fleet], object]
+    end: Callable[[Fleet], object]
+    lasts: bool = False
+    """Whether it is repaired after the seconds of the run, or at once"""
+
+    @contextlib.contextmanager
+    def inject(self, fleet: Fleet, seconds: float) -> Iterator[None]:
+        """Break the component on entry, and repair it after the body of the `with` block."""
+        self.begin(fleet)
+        try:
+            yield
+            time.sleep(seconds if self.lasts else 0)
+        finally:
+            self.end(fleet)
 
 
 def all_faults() -> list[Fault]:
     """Return all faults in the order of the documentation; a run shuffles them."""
     return [
         *map(_kill, ("gateway-0", "extractor-0", "search-0-0", "search-1-0", "steward-0")),
-        Fault(
-            "kill -9 of every service at once",
-            lambda fleet, _: _broken(fleet.kill_all, fleet.start),
-        ),
+        Fault("kill -9 of every service at once", Fleet.kill_all, Fleet.start),
         _pause("an extractor stands still beyond its lease", "extractor-0"),
         _pause("a search worker stands still", "search-0-0"),
-        Fault("FLUSHALL", lambda fleet, _: _broken(partial(_flush, fleet), partial(_flush, fleet))),
+        Fault("FLUSHALL", _flush, _flush),
         _stop("Redis stopped", "Redis"),
-        Fault("every message doubled", _duplicate_messages),
-        Fault("PostgreSQL killed and started", _restart_postgres),
+        _duplicate_messages(),
+        Fault("PostgreSQL killed and started", _restart_postgres, lambda fleet: None),
         _stop("PostgreSQL stopped", "PostgreSQL"),
         _stop("the S3 store killed", "the S3 store"),
         _disconnect("the S3 store full (507)", "the S3 store", ProxyMode.FULL),
@@ -84,53 +88,42 @@ def all_faults() -> list[Fault]:
     ]
 
 
-@contextlib.contextmanager
-def _broken(
-    begin: Callable[[], object], end: Callable[[], object], seconds: float = 0.0
-) -> Iterator[None]:
-    """Break something, and repair it so many seconds after the body of the `with` block."""
-    begin()
-    try:
-        yield
-        time.sleep(seconds)
-    finally:
-        end()
-
-
 def _kill(name: str) -> Fault:
     return Fault(
-        f"kill -9 of {name}",
-        lambda fleet, _: _broken(fleet[name].kill, partial(fleet.start, name)),
+        f"kill -9 of {name}", lambda fleet: fleet[name].kill(), lambda fleet: fleet.start(name)
     )
 
 
 def _pause(title: str, name: str) -> Fault:
-    def inject(fleet: Fleet, _seconds: float) -> AbstractContextManager[None]:
-        stop, go_on = (partial(fleet[name].signal, n) for n in (signal.SIGSTOP, signal.SIGCONT))
-        return _broken(stop, go_on, 2 * fleet.lease_seconds)
+    def resume(fleet: Fleet) -> None:
+        time.sleep(2 * fleet.lease_seconds)
+        fleet[name].signal(signal.SIGCONT)
 
-    return Fault(title, inject)
+    return Fault(title, lambda fleet: fleet[name].signal(signal.SIGSTOP), resume)
 
 
 def _stop(title: str, server: str) -> Fault:
-    def inject(fleet: Fleet, seconds: float) -> AbstractContextManager[None]:
-        process = fleet.servers.processes[server]
-        return _broken(process.kill, process.start, seconds)
+    return Fault(
+        title,
+        lambda fleet: fleet.servers.processes[server].kill(),
+        lambda fleet: fleet.servers.processes[server].start(),
+        lasts=True,
+    )
 
-    return Fault(title, inject)
 
-
-def _restart_postgres(fleet: Fleet, _seconds: float) -> AbstractContextManager[None]:
+def _restart_postgres(fleet: Fleet) -> None:
     server = fleet.servers.processes["PostgreSQL"]
-    return _broken(lambda: (server.kill(), server.start()), lambda: None)  # type: ignore[func-returns-value]
+    server.kill()
+    server.start()
 
 
 def _disconnect(title: str, server: str, mode: ProxyMode) -> Fault:
-    def inject(fleet: Fleet, seconds: float) -> AbstractContextManager[None]:
-        set_mode = fleet.servers.proxies[server].set_mode
-        return _broken(partial(set_mode, mode), partial(set_mode, ProxyMode.OPEN), seconds)
-
-    return Fault(title, inject)
+    return Fault(
+        title,
+        lambda fleet: fleet.servers.proxies[server].set_mode(mode),
+        lambda fleet: fleet.servers.proxies[server].set_mode(ProxyMode.OPEN),
+        lasts=True,
+    )
 
 
 def _flush(fleet: Fleet) -> None:
@@ -138,11 +131,14 @@ def _flush(fleet: Fleet) -> None:
         client.flushall()
 
 
-@contextlib.contextmanager
-def _duplicate_messages(fleet: Fleet, seconds: float) -> Iterator[None]:
-    with MessageDuplicator(fleet.servers.redis.url).duplicating():
-        yield
-        time.sleep(seconds)
+def _duplicate_messages() -> Fault:
+    stack = contextlib.ExitStack()
+    return Fault(
+        "every message doubled",
+        lambda fleet: stack.enter_context(MessageDuplicator(fleet.servers.redis.url).duplicating()),
+        lambda fleet: stack.close(),
+        lasts=True,
+    )
 
 
 UPLOADERS = 4

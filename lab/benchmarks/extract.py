@@ -32,7 +32,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from lab.benchmarks.load_generator import make_jpegs
-from lab.benchmarks.report import Report, parse_integers, printed_report
+from lab.benchmarks.report import Report, integers_option, printed_report
 from services.cli.environment import read_settings
 from services.cli.output import JsonOption
 from services.extractor.decoder_pool import DecoderPool
@@ -72,8 +72,7 @@ class BenchmarkedExtractor:
     def of(cls, extractor: str, device: str, folder: Path) -> BenchmarkedExtractor:
         """Find an extractor's weights; `folder` receives random ones if no others are installed.
 
-        Raises:
-            Misconfigured: the extractor or the device is not available.
+        Raises Misconfigured: the extractor or the device is not available.
         """
         settings = read_settings()
         config = settings.extractor_config(extractor)
@@ -114,13 +113,7 @@ def bench(
         Literal["auto", "float32", "bfloat16"], typer.Option(help="Precision.")
     ] = "auto",
     batches: Annotated[
-        Any,
-        typer.Option(
-            "--batch",
-            help="Maximum batch sizes, comma-separated.",
-            parser=parse_integers,
-            metavar="INTEGERS",
-        ),
+        Any, integers_option("Maximum batch sizes, comma-separated.", "--batch")
     ] = "16",
     rounds: Annotated[int, typer.Option(min=1, help="Passes over all photos.")] = 3,
     as_json: JsonOption = False,

@@ -16,7 +16,6 @@ batches=${BATCHES:-64,1,16,256}
 photos=${PHOTOS:-256}
 rounds=${ROUNDS:-1}
 search=${SEARCH:-"--photos 20000 --dimensions 512,4096"}
-train=${TRAIN:-""}
 placewise=${PLACEWISE:-.venv/bin/placewise}
 python=${PYTHON:-.venv/bin/python}
 
@@ -47,9 +46,7 @@ for extractor in $extractors; do
             --precision "$precision" --batch "$batches" --photos "$photos" --rounds "$rounds"
     done
 done
-# shellcheck disable=SC2086  # lists of options
+# shellcheck disable=SC2086  # a list of options
 SEARCH_DEVICE=$device measure 90-search search $search
-# shellcheck disable=SC2086
-measure 91-train train --device "$([ "$device" = cuda ] && echo gpu || echo "$device")" $train
-"$python" -m lab.benchmarks.results_table "$folder" >"$folder/gpu.md"
+"$python" -m lab.benchmarks.report "$folder" >"$folder/gpu.md"
 cat "$folder/gpu.md"

@@ -6,16 +6,15 @@ the clock starts, and are sent over persistent connections without a framework.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import itertools
 import json
-import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from http.client import HTTPConnection, HTTPException
-from typing import Any, Self
+from http.client import HTTPConnection
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -36,51 +35,19 @@ MAX_JPEG_QUALITY, MIN_JPEG_QUALITY = 95, 5  # JPEG qualities
 _numbers = itertools.count()
 
 
-@dataclass(frozen=True, slots=True)
-class HttpResponse:
-    status: int
-    body: bytes
-
-    def json(self) -> Any:
-        return json.loads(self.body)
+def connect(url: str) -> HTTPConnection:
+    """Return a persistent connection to a server; use it in one thread."""
+    parts = urlsplit(url)
+    return HTTPConnection(str(parts.hostname), parts.port, timeout=TIMEOUT_SECONDS)
 
 
-class HttpCaller:
-    """HTTP client of one server with a persistent connection per thread; a context manager."""
-
-    def __init__(self, url: str) -> None:
-        parts = urlsplit(url)
-        assert parts.hostname is not None
-        self.url = url
-        self._address = parts.hostname, parts.port
-        self._own = threading.local()
-        self._connections: list[HTTPConnection] = []
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the connections; call it after the threads that use them have ended."""
-        for connection in self._connections:
-            connection.close()
-
-    def post_form(self, path: str, form: bytes, **headers: str) -> HttpResponse:
-        """Return the response of any status; OSError or HTTPException if there is none."""
-        connection: HTTPConnection | None = getattr(self._own, "connection", None)
-        if connection is None:
-            connection = HTTPConnection(*self._address, timeout=TIMEOUT_SECONDS)
-            self._own.connection = connection
-            self._connections.append(connection)
-        try:
-            connection.request("POST", path, form, {**AUTH_HEADER, **CONTENT_TYPE, **headers})
-            answer = connection.getresponse()
-            return HttpResponse(answer.status, answer.read())
-        except (OSError, HTTPException):
-            connection.close()
-            raise
+def post_form(
+    connection: HTTPConnection, path: str, form: bytes, **headers: str
+) -> tuple[int, bytes]:
+    """Return status and body of the response; OSError or HTTPException if there is none."""
+    connection.request("POST", path, form, {**AUTH_HEADER, **CONTENT_TYPE, **headers})
+    answer = connection.getresponse()
+    return answer.status, answer.read()
 
 
 def make_jpegs(count: int, size: tuple[int, int], size_bytes: int) -> list[bytes]:
@@ -141,19 +108,23 @@ def upload_all(
 ) -> list[Any]:
     """Upload all files with `clients` threads and return the JSON responses.
 
-    Raises:
-        AssertionError: an upload was not accepted.
+    Raises AssertionError: an upload was not accepted.
     """
-    with HttpCaller(url) as caller:
+    waiting = iter(enumerate(forms))  # shared by the threads
+    answers: dict[int, Any] = {}
 
-        def upload(form: bytes) -> Any:
-            answer = caller.post_form(path, form)
-            assert answer.status < 300, answer.body
-            on_done()
-            return answer.json()
+    def upload() -> None:
+        with contextlib.closing(connect(url)) as connection:
+            for number, form in waiting:
+                status, body = post_form(connection, path, form)
+                assert status < 300, body
+                answers[number] = json.loads(body)
+                on_done()
 
-        with ThreadPoolExecutor(clients, thread_name_prefix="client") as pool:
-            return list(pool.map(upload, forms))
+    with ThreadPoolExecutor(clients, thread_name_prefix="client") as pool:
+        for client in [pool.submit(upload) for _ in range(clients)]:
+            client.result()
+    return [answers[number] for number in range(len(forms))]
 
 
 POLL_SECONDS = 0.2
@@ -164,8 +135,7 @@ def wait_for_jobs(
 ) -> None:
     """Wait until every stored photo is described.
 
-    Raises:
-        AssertionError: a job failed, or the timeout has passed.
+    Raises AssertionError: a job failed, or the timeout has passed.
     """
     deadline = time.monotonic() + seconds
     while True:

@@ -31,7 +31,7 @@ from lab.benchmarks.load_generator import (
     upload_all,
     wait_for_jobs,
 )
-from lab.benchmarks.report import Report, parse_integers, printed_report
+from lab.benchmarks.report import Report, integers_option, printed_report
 from services.cli.output import JsonOption
 from shared.catalog.maps import Map
 from shared.descriptors.extractor import Extractor
@@ -49,14 +49,9 @@ SERVICES = ("gateway", "extractor", "search", "steward")
 
 
 def bench(
-    widths: Annotated[
-        Any,
-        typer.Option(
-            help="Descriptor dimensions, comma-separated.",
-            parser=parse_integers,
-            metavar="INTEGERS",
-        ),
-    ] = "7168,98304",
+    widths: Annotated[Any, integers_option("Descriptor dimensions, comma-separated.")] = (
+        "7168,98304"
+    ),
     photos: Annotated[int, typer.Option(min=1)] = 320,
     batch: Annotated[int, typer.Option(min=1, help="Maximum batch size.")] = 32,
     rounds: Annotated[int, typer.Option(min=1, help="Upload rounds per gateway.")] = 5,

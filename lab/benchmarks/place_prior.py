@@ -1,6 +1,6 @@
 """Fits the prior of place models on generated cities and writes it to `prior.json`.
 
-    placewise datasets synth CITY --no-ladder --no-train --seed 1 ...   (several cities)
+    placewise datasets synth CITY --no-train --seed 1 ...   (several cities)
     python -m lab.benchmarks.place_prior CITY [CITY ...]
 
 Only coefficients are stored. Each city is described by the default extractor, with a vocabulary

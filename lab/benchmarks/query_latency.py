@@ -8,12 +8,14 @@ not for two. Reported: the time of a batch, and p50, p95 and maximum of a query.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import random
 import statistics
 import time
 from collections.abc import Sequence
 from datetime import datetime
+from http.client import HTTPConnection
 from typing import Annotated
 from uuid import UUID
 
@@ -23,10 +25,11 @@ from sqlalchemy import func, insert, select
 from lab.benchmarks.fleet import Fleet, open_fleet
 from lab.benchmarks.invariants import count_unfinished_jobs
 from lab.benchmarks.load_generator import (
-    HttpCaller,
+    connect,
     make_jpegs,
     multipart_form,
     multipart_forms,
+    post_form,
     upload_all,
     wait_for_jobs,
 )
@@ -36,6 +39,7 @@ from shared.catalog.chunks import Chunk
 from shared.catalog.photos import Photo
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
+from tests.support.catalog_rows import made_up_photo
 
 TARGET_MS_ABOVE_BATCH = 100.0
 SIZE, SIZE_BYTES = (1024, 768), 100_000
@@ -61,12 +65,12 @@ def bench(
             extractor=f"test-slow-avg:milliseconds={milliseconds},width={DESCRIPTOR_DIMENSION}",
             batch_photos=batch,
         ) as fleet,
-        HttpCaller(fleet.gateway_urls[0]) as caller,
+        contextlib.closing(connect(fleet.gateway_urls[0])) as connection,
     ):
         fleet.start()
-        first = upload_all(caller.url, multipart_forms(photos, TEXTURES), 4)
+        first = upload_all(fleet.gateway_urls[0], multipart_forms(photos, TEXTURES), 4)
         wait_for_jobs(fleet.catalog, TIMEOUT_SECONDS)
-        _time_query(caller, photos[0])  # opens connections and loads what only queries need
+        _time_query(connection, photos[0])  # opens connections and loads what only queries need
         _insert_backlog(fleet, [UUID(answer["file_id"]) for answer in first], backlog)
         since = _wait_for_chunks(fleet, 3)
         bar = progress.add_task("searching", total=seconds)
@@ -77,7 +81,7 @@ def bench(
         while (left := until - time.monotonic()) > 0:
             progress.update(bar, completed=seconds - left)
             time.sleep(rng.uniform(0, pause))
-            latencies.append(_time_query(caller, rng.choice(photos)))
+            latencies.append(_time_query(connection, rng.choice(photos)))
         periods = _batch_seconds(fleet, since, batch)
         report.add(
             "uploads still waiting at the end",
@@ -92,13 +96,13 @@ def bench(
         report.details = {"seconds": latencies, "batch_seconds": periods}
 
 
-def _time_query(caller: HttpCaller, photo: bytes) -> float:
+def _time_query(connection: HTTPConnection, photo: bytes) -> float:
     """Return the seconds until the response; AssertionError if there is none."""
     form = multipart_form(photo)
     sent_at = time.perf_counter()
-    answer = caller.post_form("/api/v1/similarity?top_k=1", form, Prefer="wait=30")
+    status, body = post_form(connection, "/api/v1/similarity?top_k=1", form, Prefer="wait=30")
     seconds = time.perf_counter() - sent_at
-    assert answer.status == 200, answer.body
+    assert status == 200, body
     return seconds
 
 
@@ -106,41 +110,21 @@ def _insert_backlog(fleet: Fleet, photo_ids: Sequence[UUID], count: int) -> None
     """Insert uploads directly into the catalog, because sending thousands of photos takes long."""
     with fleet.catalog.write() as session:
         known = [session.get_one(Photo, photo_id) for photo_id in photo_ids]
-        shared = [
+        map_id = known[0].map_id
+        keys = itertools.islice(itertools.cycle(photo.object_key for photo in known), count)
+        photos = [made_up_photo(map_id, object_key=key, job_id=new_id()) for key in keys]
+        session.execute(insert(Photo), photos)
+        jobs = [
             {
-                column: getattr(photo, column)
-                for column in ("map_id", "object_key", "filename", "media_type", "size_bytes")
+                "id": photo["job_id"],
+                "map_id": map_id,
+                "kind": JobKind.INDEX,
+                "priority": Priority.UPLOAD,
+                "photo_id": photo["id"],
             }
-            for photo in known
+            for photo in photos
         ]
-        ids = [(new_id(), new_id()) for _ in range(count)]
-        session.execute(
-            insert(Photo),
-            [
-                {
-                    **shared[number % len(shared)],
-                    "id": photo,
-                    "job_id": job,
-                    "sha256": f"{number:064d}",
-                    "width": SIZE[0],
-                    "height": SIZE[1],
-                }
-                for number, (photo, job) in enumerate(ids)
-            ],
-        )
-        session.execute(
-            insert(Job),
-            [
-                {
-                    "id": job,
-                    "map_id": known[0].map_id,
-                    "kind": JobKind.INDEX,
-                    "priority": Priority.UPLOAD,
-                    "photo_id": photo,
-                }
-                for photo, job in ids
-            ],
-        )
+        session.execute(insert(Job), jobs)
 
 
 def _wait_for_chunks(fleet: Fleet, count: int) -> datetime:

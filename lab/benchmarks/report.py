@@ -4,14 +4,22 @@ The table of a report has these columns: what was measured; the value; its targe
 whether the target was met; and the load average of the machine (the number of processes that were
 running or waiting, over the last minute) when the value was added. On two cores, a load average
 well above 2 means that other work slowed the measurement down.
+
+    python -m lab.benchmarks.report FOLDER
+
+prints one Markdown table of the JSON reports in a folder. A measurement without a report has a file
+`.err` instead; its last line is shown.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
+import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -90,14 +98,7 @@ class Report:
 
     def as_json(self) -> dict[str, Any]:
         figures = [
-            {
-                "what": figure.what,
-                "measured": figure.measured,
-                "unit": figure.unit,
-                "target": figure.bound or None,
-                "missed": figure.missed,
-                "load_average": figure.load_average,
-            }
+            {**asdict(figure), "target": figure.bound or None, "missed": figure.missed}
             for figure in self.figures
         ]
         return {"title": self.title, "missed": self.missed, "figures": figures, **self.details}
@@ -120,8 +121,7 @@ class Report:
 def printed_report(title: str, as_json: bool) -> Iterator[tuple[Report, Progress]]:
     """Yield an empty report and progress bars for a benchmark command, and print the report.
 
-    Raises:
-        typer.Exit: with code 1, if a value misses its target.
+    Raises typer.Exit: with code 1, if a value misses its target.
     """
     report = Report(title)
     with progress_bar() as progress:
@@ -138,8 +138,7 @@ def printed_report(title: str, as_json: bool) -> Iterator[tuple[Report, Progress
 def parse_integers(text: str) -> list[int]:
     """Parse a comma-separated list of positive integers; returns them sorted and unique.
 
-    Raises:
-        typer.BadParameter: the text is no such list.
+    Raises typer.BadParameter: the text is no such list.
     """
     try:
         numbers = sorted({int(part) for part in text.split(",")})
@@ -148,6 +147,11 @@ def parse_integers(text: str) -> list[int]:
     if numbers[0] < 1:
         raise typer.BadParameter("numbers must be at least 1")
     return numbers
+
+
+def integers_option(help_text: str, *names: str) -> Any:
+    """Return a typer option whose value is a comma-separated list of positive integers."""
+    return typer.Option(*names, help=help_text, parser=parse_integers, metavar="INTEGERS")
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,3 +176,26 @@ def _format_number(value: float) -> str:
     if value == int(value) and abs(value) < 1e9:
         return f"{value:,.0f}"
     return f"{value:,.1f}" if abs(value) >= 10 else f"{value:.3g}"
+
+
+def markdown_lines(folder: Path) -> Iterator[str]:
+    """Yield the lines of the table of a folder's reports, in the order of the file names."""
+    yield "| measurement | what | value | target | load |"
+    yield "|---|---|---|---|---|"
+    for file in sorted([*folder.glob("*.json"), *folder.glob("*.err")]):
+        if file.suffix == ".err":
+            reason = (file.read_text().strip().splitlines() or ["no result"])[-1]
+            yield f"| {file.stem} | **not measured**: {reason} | | | |"
+            continue
+        report = json.loads(file.read_text())
+        for figure in report["figures"]:
+            target = (figure["target"] or "") + (", missed" if figure["missed"] else "")
+            yield (
+                f"| {file.stem}: {report['title']} | {figure['what']} "
+                f"| {figure['measured']:.4g} {figure['unit']} | {target} "
+                f"| {figure['load_average']:.1f} |"
+            )
+
+
+if __name__ == "__main__":
+    print("\n".join(markdown_lines(Path(sys.argv[1]))))

@@ -33,7 +33,7 @@ import typer
 from numpy.typing import NDArray
 from rich.progress import Progress
 
-from lab.benchmarks.report import LatencySummary, Report, parse_integers, printed_report
+from lab.benchmarks.report import LatencySummary, Report, integers_option, printed_report
 from lab.benchmarks.synthetic_map import (
     CHUNK_ROWS,
     SyntheticCity,
@@ -96,20 +96,10 @@ QUERY_CASES = (
 
 def bench(
     photos: Annotated[
-        Any,
-        typer.Option(
-            help="Numbers of photos in the map, comma-separated.",
-            parser=parse_integers,
-            metavar="INTEGERS",
-        ),
+        Any, integers_option("Numbers of photos in the map, comma-separated.")
     ] = "2000",
     dimensions: Annotated[
-        Any,
-        typer.Option(
-            help="Descriptor dimensions, multiples of 64, comma-separated.",
-            parser=parse_integers,
-            metavar="INTEGERS",
-        ),
+        Any, integers_option("Descriptor dimensions, multiples of 64, comma-separated.")
     ] = "512,7168,98304",
     queries: Annotated[int, typer.Option(min=2, help="Queries of each kind.")] = 20,
     growth: Annotated[
@@ -153,12 +143,9 @@ TOLERANCE = 1e-9  # of a score; float64 sums of 98,304 products differ by less t
 
 
 class BruteForce:
-    """Ground truth of searches: cosines of n photos with q queries, in float64.
+    """Ground truth of searches: float64 cosines of n photos with (q, dimension) queries.
 
-    Args:
-        pieces: The photos' L2-normalised rows, in order.
-        photo_ids: Their ids.
-        queries: (q, dimension) rows.
+    `pieces` are the photos' L2-normalised rows, in the order of `photo_ids`.
     """
 
     def __init__(self, pieces: Sequence[Rows], photo_ids: Sequence[UUID], queries: Rows) -> None:

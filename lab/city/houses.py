@@ -166,12 +166,7 @@ def draw_house(
 ) -> Image.Image:
     """Draw a random house for a plot, from its chimneys to the pavement: RGBA with material codes.
 
-    Args:
-        rng: The house's own random stream.
-        width_m: Width of the plot.
-        shopping: Probability that it has shops.
-        floors: Typical number of floors in its row.
-        style: Parts of the city's houses.
+    `shopping` is the probability that it has shops, `floors` the typical number in its row.
     """
     bays = max(1, round(width_m / rng.uniform(2.3, 3.3)))
     floors = int(np.clip(floors + rng.integers(-1, 2), 2, 5))

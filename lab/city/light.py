@@ -29,17 +29,7 @@ Light = NDArray[np.float32]
 def take_photo(
     canvas: Canvas, session: CaptureSession, lamps: Sequence[Floats], rng: np.random.Generator
 ) -> Image.Image:
-    """Light a view and expose it.
-
-    Args:
-        canvas: What the camera sees.
-        session: Its light, weather and camera.
-        lamps: (3,) metres of the street lamps around.
-        rng: The photo's own random stream.
-
-    Returns:
-        The RGB photo.
-    """
+    """Make an RGB photo of a view; `lamps` are (3,) metres of the street lamps around."""
     camera, texels = canvas.camera, canvas.texels
     whole = Image.frombuffer("RGBX", texels.shape[::-1], texels, "raw", "RGBX", 0, 1)
     colours = np.asarray(whole.reduce(SUPERSAMPLING))[..., :3] * np.float32(1 / 255)

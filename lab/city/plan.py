@@ -8,13 +8,12 @@ training photos, so that no place of the evaluation is in the training set.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lab.city.camera import Camera
 from lab.city.rides import plan_ride
@@ -98,17 +97,6 @@ class CityPlan:
     photos: list[PlannedPhoto]
     """Sorted so that neighbours in a street follow each other"""
 
-    def evaluation_photos(self) -> tuple[list[PlannedPhoto], list[PlannedPhoto]]:
-        """Return the database photos, and the queries whose place is in the map."""
-        database = [photo for photo in self.photos if photo.role == "database"]
-        queries = [p for p in self.photos if p.role == "query" and p.kind != "out_of_map"]
-        return database, queries
-
-
-def positions_m(photos: Sequence[PlannedPhoto]) -> NDArray[np.float64]:
-    """Return the (n, 2) UTM metres of the photos' cameras."""
-    return np.array([(photo.camera.x, photo.camera.y) for photo in photos])
-
 
 def city_name(options: CityOptions) -> str:
     """Return the lowercase name of the city, as used in gsv_xs."""
@@ -158,30 +146,18 @@ def _database_photos(options: CityOptions, places: list[ViewPoint]) -> Iterator[
             session = DATABASE_SESSIONS[view % len(DATABASE_SESSIONS)]
             step = view // len(DATABASE_SESSIONS)
             share = 2 * step / (steps - 1) - 1 if steps > 1 else 0.0
-            camera = _camera(
-                options,
-                place,
-                along=share * STEP_M + rng.normal(0, 0.3),
-                across=rng.normal(0, 0.25),
-                yaw=-share * 6 + rng.normal(0, 2),
-                fov=DATABASE_FOV,
-                rng=rng,
-            )
+            along, across = share * STEP_M + rng.normal(0, 0.3), rng.normal(0, 0.25)
+            yaw = -share * 6 + rng.normal(0, 2)
+            camera = _camera(options, place, along, across, yaw, DATABASE_FOV, rng)
             number = place.number * options.views + view
             yield _plan_photo(options, "database", "in_map", place, camera, session, number)
 
 
 def _query_photo(options: CityOptions, place: ViewPoint, kind: str, number: int) -> PlannedPhoto:
     rng = random_stream(options.seed, "query", number)
-    camera = _camera(
-        options,
-        place,
-        along=rng.uniform(-QUERY_ALONG_M, QUERY_ALONG_M),
-        across=rng.uniform(-QUERY_ACROSS_M, QUERY_ACROSS_M),
-        yaw=rng.uniform(-QUERY_YAW, QUERY_YAW) + (180 if kind == "other_way" else 0),
-        fov=rng.uniform(*QUERY_FOV),
-        rng=rng,
-    )
+    along, across = (rng.uniform(-most, most) for most in (QUERY_ALONG_M, QUERY_ACROSS_M))
+    yaw = rng.uniform(-QUERY_YAW, QUERY_YAW) + (180 if kind == "other_way" else 0)
+    camera = _camera(options, place, along, across, yaw, rng.uniform(*QUERY_FOV), rng)
     session = QUERY_SESSIONS[int(rng.integers(len(QUERY_SESSIONS)))]
     return _plan_photo(options, "query", kind, place, camera, session, number)
 
@@ -195,15 +171,8 @@ def _ride_photos(
         fov = random_stream(options.seed, "ride", session.name).uniform(*QUERY_FOV)
         for number, frame in enumerate(frames):
             rng = random_stream(options.seed, "ride", session.name, number)
-            camera = _camera(
-                options,
-                frame.place,
-                along=frame.along,
-                across=rng.normal(0, 0.1),
-                yaw=rng.normal(0, 1.5),
-                fov=fov,
-                rng=rng,
-            )
+            across, yaw = rng.normal(0, 0.1), rng.normal(0, 1.5)
+            camera = _camera(options, frame.place, frame.along, across, yaw, fov, rng)
             kind = "in_map" if frame.is_in_map else "out_of_map"
             yield _plan_photo(options, "ride", kind, frame.place, camera, session, number)
 
@@ -215,15 +184,10 @@ def _train_photos(options: CityOptions, places: list[ViewPoint]) -> Iterator[Pla
         order = random_stream(options.seed, "train", place.number).permutation(len(SESSIONS))
         for view in range(views):
             rng = random_stream(options.seed, "train", place.number, view)
-            camera = _camera(
-                options,
-                place,
-                along=rng.uniform(-QUERY_ALONG_M, QUERY_ALONG_M) * 0.7,
-                across=rng.uniform(-QUERY_ACROSS_M, QUERY_ACROSS_M),
-                yaw=rng.uniform(-QUERY_YAW, QUERY_YAW) * 0.7,
-                fov=rng.uniform(*QUERY_FOV),
-                rng=rng,
-            )
+            along, across = (rng.uniform(-most, most) for most in (QUERY_ALONG_M, QUERY_ACROSS_M))
+            yaw = rng.uniform(-QUERY_YAW, QUERY_YAW) * 0.7
+            fov = rng.uniform(*QUERY_FOV)
+            camera = _camera(options, place, along * 0.7, across, yaw, fov, rng)
             number, session = place.number * views + view, SESSIONS[int(order[view])]
             yield _plan_photo(options, "train", "in_map", place, camera, session, number)
 
@@ -231,17 +195,13 @@ def _train_photos(options: CityOptions, places: list[ViewPoint]) -> Iterator[Pla
 def _camera(
     options: CityOptions,
     place: ViewPoint,
-    *,
     along: float,
     across: float,
     yaw: float,
     fov: float,
     rng: np.random.Generator,
 ) -> Camera:
-    """Create a camera displaced and rotated from the place's view point.
-
-    The position is rounded to centimetres as in file names, so that both agree.
-    """
+    """Create a camera near a place's view point, at whole centimetres, as file names have them."""
     street = place.street
     position = street.start + street.direction * (place.along + along)
     position = position + street.left * (across - LANE_M)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +80,12 @@ class Quarter:
         self._along = rng.choice(HALF_WIDTHS_M, count)  # streets that run east
         self.streets = self._lay_streets(rng, count)
         self.sides = self._build_blocks(rng, count)
+        self.side_starts = np.stack([side.start for side in self.sides])
+        """(sides, 2) start points of the facade rows"""
+        self.side_directions = np.stack([side.direction for side in self.sides])
+        """(sides, 2) unit vectors"""
+        self.side_lengths = np.array([side.length for side in self.sides])
+        """(sides,)"""
 
     @property
     def far_east(self) -> float:
@@ -115,18 +120,8 @@ class Quarter:
         sides = []
         for i in range(count - 1):
             for j in range(count - 1):
-                corners = [
-                    self.nodes[i, j],
-                    self.nodes[i + 1, j],
-                    self.nodes[i + 1, j + 1],
-                    self.nodes[i, j + 1],
-                ]
-                insets = [
-                    self._along[j],
-                    self._across[i + 1],
-                    self._along[j + 1],
-                    self._across[i],
-                ]
+                corners = [self.nodes[i + x, j + y] for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
+                insets = [self._along[j], self._across[i + 1], self._along[j + 1], self._across[i]]
                 outline = _inset(corners, insets)
                 for k in range(4):
                     start, end = outline[k], outline[(k + 1) % 4]
@@ -143,21 +138,6 @@ class Quarter:
                         )
                     )
         return sides
-
-    @cached_property
-    def side_starts(self) -> Metres:
-        """(sides, 2) start points of the facade rows."""
-        return np.stack([side.start for side in self.sides])
-
-    @cached_property
-    def side_directions(self) -> Metres:
-        """(sides, 2) unit vectors of the facade rows."""
-        return np.stack([side.direction for side in self.sides])
-
-    @cached_property
-    def side_lengths(self) -> Metres:
-        """(sides,) lengths of the facade rows."""
-        return np.array([side.length for side in self.sides])
 
 
 def _inset(corners: list[Metres], insets: list[float]) -> list[Metres]:

@@ -74,16 +74,10 @@ def draw_surface(
     spread: float = 0.0,
     code: int = CODE_SOLID,
 ) -> Image.Image:
-    """Draw a seamless RGBA tile of `size` x `size` pixels.
+    """Draw a seamless RGBA tile of `size` x `size` pixels, a power of two, of a mean colour.
 
-    Args:
-        rng: The tile's own.
-        size: A power of two.
-        colour: Its mean.
-        brick: Height and length in pixels of bricks, ashlars or slabs in running bond, which
-            divide the size; None for a plain surface.
-        spread: Standard deviation of their lightness.
-        code: Material code.
+    `brick` is the height and length in pixels of bricks, ashlars or slabs in running bond, which
+    divide the size; `spread` the standard deviation of their lightness; `code` the material code.
     """
     light = (
         1 + 0.05 * smooth_noise(rng, (size, size), 96) + 0.03 * smooth_noise(rng, (size, size), 24)

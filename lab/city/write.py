@@ -1,7 +1,4 @@
-"""Renders a planned city on all cores and writes it as a dataset.
-
-Training photos are written in the layout gsv_xs, or in that of the original GSV-Cities.
-"""
+"""Renders a planned city on all cores and writes it as a dataset, its training set as gsv_xs."""
 
 from __future__ import annotations
 
@@ -13,82 +10,31 @@ import signal
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, replace
-from enum import StrEnum
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import utm
-
 from lab.city.light import encode_jpeg, take_photo
-from lab.city.plan import ZONE_LETTER, ZONE_NUMBER, CityPlan, PlannedPhoto, city_name
+from lab.city.plan import CityPlan, PlannedPhoto, city_name
 from lab.city.scene import CityStyle, Scene
 from lab.city.textures import random_stream
 from shared.errors import Conflict, Misconfigured
 
 GSV_XS_COLUMNS = ("place_id", "class_name", "UTMx", "UTMy", "filename")
-GSV_CITIES_COLUMNS = (
-    "place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid",
-)  # fmt: skip
-
-
-class TrainingLayoutName(StrEnum):
-    """Layout of the training photos."""
-
-    GSV_XS = "gsv_xs"
-    GSV_CITIES = "gsv-cities"
-
-
-def with_training_layout(plan: CityPlan, layout: TrainingLayoutName) -> CityPlan:
-    """Return the plan with the training photos in the folders and names of a layout."""
-    if layout == TrainingLayoutName.GSV_XS:
-        return plan
-    folder = f"{layout}/Images/{city_name(plan.options)}"
-    photos = [
-        replace(photo, folder=folder, name=f"{'_'.join(_gsv_cities_fields(plan, photo))}.jpg")
-        if photo.role == "train"
-        else photo
-        for photo in plan.photos
-    ]
-    return CityPlan(plan.options, plan.quarters, photos)
 
 
 def _write_training_table(plan: CityPlan, out: Path) -> None:
-    """Write the CSV table of the training photos, in the layout of their folder."""
+    """Write the CSV table of the training photos."""
     city = city_name(plan.options)
     train = sorted((s for s in plan.photos if s.role == "train"), key=lambda photo: photo.number)
-    columns: tuple[str, ...] = GSV_XS_COLUMNS
-    path = out / TrainingLayoutName.GSV_XS / "dataframes" / f"{city}.csv"
-    rows: list[tuple[object, ...]] = [
+    rows = [
         (photo.place, city, f"{photo.camera.x:.2f}", f"{photo.camera.y:.2f}", photo.name)
         for photo in train
     ]
-    if train and not train[0].folder.startswith(TrainingLayoutName.GSV_XS):
-        columns = GSV_CITIES_COLUMNS
-        path = out / TrainingLayoutName.GSV_CITIES / "Dataframes" / f"{city}.csv"
-        fields = [_gsv_cities_fields(plan, photo) for photo in train]
-        rows = [
-            (photo.place, int(year), int(month), int(heading), city, *rest)
-            for photo, (_, _, year, month, heading, *rest) in zip(train, fields, strict=True)
-        ]
+    path = out / "gsv_xs" / "dataframes" / f"{city}.csv"
     path.parent.mkdir(parents=True)
     with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file, lineterminator="\n").writerows([columns, *rows])
-
-
-def _gsv_cities_fields(plan: CityPlan, photo: PlannedPhoto) -> tuple[str, ...]:
-    """Return city, place, year, month, heading, latitude, longitude and panorama id."""
-    latitude, longitude = utm.to_latlon(photo.camera.x, photo.camera.y, ZONE_NUMBER, ZONE_LETTER)
-    return (
-        city_name(plan.options),
-        f"{photo.place:07d}",
-        f"{photo.session.starts_at:%Y}",
-        f"{photo.session.starts_at:%m}",
-        f"{round(photo.camera.yaw) % 360:03d}",
-        f"{float(latitude):.6f}",
-        f"{float(longitude):.6f}",
-        f"{photo.quarter}{photo.place:05d}-{photo.session.name}-{photo.number:06d}",
-    )
+        csv.writer(file, lineterminator="\n").writerows([GSV_XS_COLUMNS, *rows])
 
 
 PHOTOS_PER_TASK = 160
@@ -111,14 +57,10 @@ def check_output_empty(out: Path) -> None:
 def write_city(
     plan: CityPlan, out: Path, on_progress: Callable[[int], None] = lambda count: None
 ) -> None:
-    """Write `database/`, `queries/`, `gsv_xs/` (or `gsv-cities/`) and `city.json` below `out`.
+    """Write `database/`, `queries/`, `gsv_xs/` and `city.json` below `out`.
 
-    Training photos are of a separate quarter. `on_progress` is called with the number of photos
-    written since the last call.
-
-    Raises:
-        Conflict: `out_not_empty`.
-        Misconfigured: `out_unwritable`.
+    `on_progress` is called with the number of photos written since the last call. Raises Conflict
+    (`out_not_empty`), Misconfigured (`out_unwritable`).
     """
     check_output_empty(out)
     try:

@@ -10,7 +10,7 @@ for seed in ${SEEDS:-1 2 3}; do
     places="$RUNS/places-$seed"
     trained="$RUNS/seed-$seed"
     [ -f "$places/city.json" ] ||
-        placewise datasets synth "$places" --places 500 --queries 450 --seed "$seed" --no-ladder
+        placewise datasets synth "$places" --places 500 --queries 450 --seed "$seed"
     if [ -f "$trained/checkpoints/last.ckpt" ]; then
         placewise train --resume "$trained"
     else

@@ -13,15 +13,15 @@ import statistics
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 from rich.markup import escape
 from rich.table import Column
 
 from lab.cli.datasets.synth import synth
+from lab.cli.evaluation.commands import ProtocolOption, RuleOption
 from lab.datasets.check import (
     MAX_RULE_MULTIPLE,
     DatasetProblem,
@@ -52,10 +52,6 @@ from services.cli.output import (
 )
 from shared.errors import InvalidRequest
 
-ProtocolOption = Annotated[
-    str | None, typer.Option(help="Evaluation protocol, such as msls-official or vme.")
-]
-
 
 def check(
     folder: Annotated[Path, typer.Argument(help="A data set, or a folder of data sets.")],
@@ -63,12 +59,7 @@ def check(
         bool, typer.Option("--decode", help="Decode every photo completely.")
     ] = False,
     protocol: ProtocolOption = None,
-    rule: Annotated[
-        str | None,
-        typer.Option(
-            help="Positive-match criterion: radius 25, heading 25 40, frames 5, place-label."
-        ),
-    ] = None,
+    rule: RuleOption = None,
     min_photos: Annotated[int, typer.Option(min=1, help="Ignore places with fewer photos.")] = 2,
     as_json: JsonOption = False,
 ) -> None:
@@ -313,7 +304,7 @@ def audit(
         typer.Option("--set", help="Set of the data set. Required if there are several."),
     ] = None,
     protocol: ProtocolOption = None,
-    rule: Annotated[str | None, typer.Option(help="Positive-match criterion.")] = None,
+    rule: RuleOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """List confident first matches that are near the query but count as wrong.
@@ -321,16 +312,16 @@ def audit(
     Near means within 4 times the criterion's metres or frames, regardless of heading. Review these
     pairs: if both photos show the same place, the ground truth is wrong, not the descriptor.
     """
+    # Loads faiss, which the other commands do not need.
+    from lab.evaluation.results import check_predictions, load_matrix, read_predictions
+
     evaluation = open_evaluation_set(folder, name, protocol=protocol, rule=rule)
-    ranked = _load_array(predictions, "iu").astype(np.int64)
-    outside = ranked.size and not 0 <= ranked.min() <= ranked.max() < len(evaluation.database)
-    if outside:
-        raise InvalidRequest(
-            "predictions_out_of_range",
-            f"{predictions} contains indices from {ranked.min()} to {ranked.max()}, but the "
-            f"database of {evaluation.name} has {len(evaluation.database)} photos.",
-        )
-    score_rows = None if scores is None else _load_array(scores, "f").astype(np.float32)
+    ranked = read_predictions(predictions)
+    check_predictions(predictions, ranked, evaluation.positives, len(evaluation.database))
+    score_rows = None
+    if scores is not None:
+        expected = "a (queries, k) array of scores"
+        score_rows = load_matrix(scores, "f", "bad_predictions", expected).astype(np.float32)
     suspects = find_suspect_labels(evaluation, ranked, score_rows, min_score=min_score)
     if as_json:
         print_json(
@@ -370,18 +361,6 @@ def _print_suspects(suspects: list[SuspectLabel]) -> None:
     print_table(table)
     if len(suspects) > MAX_SUSPECTS_SHOWN:
         print_message(f"and {len(suspects) - MAX_SUSPECTS_SHOWN} more. --json lists all of them.")
-
-
-def _load_array(path: Path, kinds: str) -> NDArray[Any]:
-    try:
-        rows: NDArray[Any] = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InvalidRequest("bad_predictions", f"Can't read {path}: {error}.") from error
-    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.dtype.kind not in kinds:
-        raise InvalidRequest(
-            "bad_predictions", f"{path} must contain a (queries, k) array of numbers."
-        )
-    return rows
 
 
 app = typer.Typer(help="Check, complete and generate data sets.", no_args_is_help=True)

@@ -8,38 +8,18 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Column
 
-from lab.city.plan import CityOptions, CityPlan, make_plan
-from lab.city.write import (
-    NOT_COMPARABLE,
-    TrainingLayoutName,
-    check_output_empty,
-    describe_city,
-    with_training_layout,
-    write_city,
-)
-from lab.cli.datasets.baselines import BASELINE_KS, evaluate_baselines
-from services.cli.output import (
-    Json,
-    JsonOption,
-    Table,
-    format_percent,
-    print_json,
-    print_message,
-    print_table,
-    progress_bar,
-)
+from lab.city.plan import CityOptions, make_plan
+from lab.city.write import NOT_COMPARABLE, check_output_empty, describe_city, write_city
+from services.cli.output import JsonOption, print_result, progress_bar
 
-RECALL_COLUMNS = ("R@1 in map", "R@1 other way")
 SIZE_PATTERN = re.compile(r"(\d{2,4})x(\d{2,4})")
 
 
 def parse_size(text: str) -> tuple[int, int]:
     """Parse `320x240` to (width, height).
 
-    Raises:
-        typer.BadParameter: Invalid format, or a side outside 64 to 1920.
+    Raises typer.BadParameter: Invalid format, or a side outside 64 to 1920.
     """
     match = SIZE_PATTERN.fullmatch(text)
     if match is None or not all(64 <= int(side) <= 1920 for side in match.groups()):
@@ -63,9 +43,6 @@ def synth(
         typer.Option(min=0.0, max=1.0, help="Share of queries outside the map."),
     ] = 0.1,
     size: Annotated[str, typer.Option(metavar="WxH", help="Photo size in pixels.")] = "320x240",
-    ladder: Annotated[
-        bool, typer.Option(help="Evaluate baselines on the city; takes minutes and needs torch.")
-    ] = True,
     train: Annotated[
         bool, typer.Option(help="Also generate a training set; nearly half of the run time.")
     ] = True,
@@ -79,17 +56,13 @@ def synth(
             "one frame per second, with stops, a detour outside the map and a jump.",
         ),
     ] = 0,
-    layout: Annotated[
-        TrainingLayoutName, typer.Option(help="Layout of the training set.")
-    ] = TrainingLayoutName.GSV_XS,
     as_json: JsonOption = False,
 ) -> None:
     """Generate a synthetic city with a database, queries and a training set.
 
     The output is deterministic for given arguments. Photos in OUT/database and OUT/queries have
-    @UTM@ names, those in OUT/rides/SEASON too. OUT/gsv_xs (or OUT/gsv-cities) is the training set,
-    with separate streets.
-    OUT/city.json contains the arguments and the kind of each query.
+    @UTM@ names, those in OUT/rides/SEASON too. OUT/gsv_xs is the training set, with separate
+    streets. OUT/city.json contains the arguments and the kind of each query.
     """
     width, height = parse_size(size)
     query_count = queries if queries is not None else max(1, places // 2)
@@ -98,59 +71,23 @@ def synth(
     )
     check_output_empty(out)
     started = time.perf_counter()
-    plan = with_training_layout(make_plan(options), layout)
+    plan = make_plan(options)
     with progress_bar() as progress:
         bar = progress.add_task("rendering", total=len(plan.photos))
         write_city(plan, out, lambda count: progress.advance(bar, count))
-        seconds = time.perf_counter() - started
-        baselines = evaluate_baselines(plan, out, progress) if ladder else []
-    figures = {
-        **_city_summary(plan, out, seconds),
-        "ladder": baselines,
-        "seconds": time.perf_counter() - started,
-    }
-    if as_json:
-        print_json(figures)
-        return
-    _print_figures(figures)
-
-
-def _print_figures(figures: Json) -> None:
-    counts, kinds, drawing = figures["counts"], figures["query_kinds"], figures["drawing"]
-    print_message(
-        f"{figures['out']}: {counts['database']} database photos, {counts['query']} queries, "
-        f"{counts.get('train', 0)} training photos; rendered at "
-        f"{drawing['photos_per_second']:.0f} photos/s, {figures['seconds']:.0f} s in total."
-    )
-    if not figures["ladder"]:
-        return
-    table = Table(
-        "baseline", *(Column(f"R@{k}", justify="right") for k in BASELINE_KS), *RECALL_COLUMNS
-    )
-    for baseline in figures["ladder"]:
-        table.add_row(
-            baseline["rung"],
-            *(format_percent(baseline["recall"][str(k)]) for k in BASELINE_KS),
-            *(
-                format_percent(baseline[f"recall_{kind}"]["1"])
-                if baseline[f"recall_{kind}"]
-                else "-"
-                for kind in ("in_map", "other_way")
-            ),
-        )
-    print_table(table)
-    print_message(
-        f"Recall over {kinds.get('in_map', 0)} queries in the map and "
-        f"{kinds.get('other_way', 0)} that look in the opposite direction; radius 25 m."
-    )
-    print_message(NOT_COMPARABLE)
-
-
-def _city_summary(plan: CityPlan, out: Path, seconds: float) -> Json:
+    seconds = time.perf_counter() - started
+    rate = len(plan.photos) / seconds
     description = describe_city(plan)
-    return {
-        "out": str(out),
-        "note": NOT_COMPARABLE,
-        **{key: description[key] for key in ("arguments", "counts", "query_kinds")},
-        "drawing": {"seconds": seconds, "photos_per_second": len(plan.photos) / seconds},
-    }
+    counts = description["counts"]
+    print_result(
+        {
+            "out": str(out),
+            "note": NOT_COMPARABLE,
+            **{key: description[key] for key in ("arguments", "counts", "query_kinds")},
+            "drawing": {"seconds": seconds, "photos_per_second": rate},
+        },
+        as_json,
+        f"{out}: {counts['database']} database photos, {counts['query']} queries, "
+        f"{counts.get('train', 0)} training photos; rendered at {rate:.0f} photos/s, "
+        f"{seconds:.0f} s in total. {NOT_COMPARABLE.capitalize()}.",
+    )

@@ -1,4 +1,4 @@
-"""From generated places to an answer: drawn, trained on, evaluated, added, indexed, searched."""
+"""The tutorial of docs/how-to/train.md: drawn, trained on, evaluated, added, indexed, searched."""
 
 from __future__ import annotations
 
@@ -11,25 +11,9 @@ import pytest
 from tests.support.server import ServerProcess, environment, run_command
 
 MAP = "city"
-STEPS = 3
 COMMAND_SECONDS = 600.0  # seconds of work, of which a busy machine makes minutes
-TRAINING = {
-    "backbone_arch": "resnet18",
-    "pretrained": "False",
-    "layers_to_freeze": "-1",
-    "layers_to_crop": "[3,4]",
-    "agg_arch": "GeM",
-    "image_size": "[48,64]",
-    "batch_size": "4",
-    "max_epochs": "1",
-    "max_steps": str(STEPS),
-    "num_workers": "0",
-    "accelerator": "cpu",
-    "faiss_gpu": "False",
-    "logger": "none",
-    "default_root_dir": "runs",
-    "run_name": "short",
-}
+CONFIG = Path(__file__).parents[3] / "configs" / "train-boq.yaml"
+SMALL = {"max_steps": 1, "image_size": 64, "batch_size": 4, "num_workers": 0, "logger": "none"}
 
 
 class CommandLine:
@@ -64,11 +48,12 @@ def test_a_model_is_trained_evaluated_added_and_answers(
     server: ServerProcess, placewise: CommandLine
 ) -> None:
     city = placewise.folder / "city"
-    small = ("--places", "6", "--views", "3", "--queries", "3", "--size", "96x72", "--no-ladder")
+    small = ("--places", "6", "--views", "3", "--queries", "3", "--size", "96x72")
     placewise("datasets", "synth", city, *small)
 
-    options = [text for name, value in TRAINING.items() for text in (f"--{name}", value)]
-    trained = placewise("train", "--data_root", city, *options)
+    folder = ("--data_root", city, "--default_root_dir", "runs", "--run_name", "short")
+    options = [f"--{name}={value}" for name, value in SMALL.items()]
+    trained = placewise("train", "--config", CONFIG, *folder, *options)
     best = Path(trained["best"]["path"])
     if not best.is_absolute():
         best = placewise.folder / best

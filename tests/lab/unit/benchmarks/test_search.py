@@ -63,16 +63,6 @@ def test_descriptors_have_the_structure_of_vlad() -> None:
     assert best[:, 9].max() < 0.25
 
 
-def test_places_of_a_walk_are_shown_by_one_three_or_thirty_photos() -> None:
-    city = SyntheticCity(7168, seed=3)
-    for walk, count in enumerate((1, 3, 30)):
-        looks = city.walk(walk).looks
-        alike = np.einsum("nkd,nkd->n", looks[1:], looks[:-1]) / looks[0].size
-        changes = np.flatnonzero(alike < 0.92) + 1
-        assert np.all(changes % count == 0)
-        assert len(changes) >= 249 // count - 1
-
-
 def test_the_same_seed_makes_the_same_city_whatever_the_chunks() -> None:
     one = np.concatenate(list(SyntheticCity(512, 1).chunks(600, 100)))
     other = np.concatenate(list(SyntheticCity(512, 1).chunks(600, 1000)))
@@ -104,11 +94,6 @@ def test_another_order_another_photo_another_score_and_a_missing_one_are_no_righ
         assert not same_ranking(found, truth)
     assert same_ranking([(IDS[0], 0.91), (IDS[1], 0.81)], truth, tolerance=np.inf)
     assert not same_ranking([(IDS[1], 0.81), (IDS[0], 0.91)], truth, tolerance=np.inf)
-
-
-def test_memory_is_enough_for_codes_and_not_for_the_rows_of_a_coded_map() -> None:
-    assert required_memory_bytes(10_000, 98_304) == 10_000 * 12_288
-    assert required_memory_bytes(1000, 512) >= 1000 * 4 * 512
 
 
 def test_whole_run_finds_no_wrong_answer_and_measures_everything(tmp_path: Path) -> None:

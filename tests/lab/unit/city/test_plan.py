@@ -39,13 +39,6 @@ def test_each_place_has_its_views_and_queries_are_as_many_of_each_kind_as_reques
     assert kinds == {"in_map": 88, "other_way": 8, "out_of_map": 24}
 
 
-@pytest.mark.parametrize(("share", "expected"), [(0.0, 0), (1.0, 120)])
-def test_no_query_or_every_query_may_be_out_of_the_map(share: float, expected: int) -> None:
-    options = CityOptions(20, 2, 120, 0, 0, share, 64, 64)
-    shots = of_role(make_plan(options), "query")
-    assert sum(shot.kind == "out_of_map" for shot in shots) == expected
-
-
 def test_queries_on_the_map_have_positives_and_those_outside_are_200_metres_away(
     plan: CityPlan,
 ) -> None:
@@ -76,22 +69,6 @@ def test_places_of_a_street_lie_15_to_25_metres_apart(plan: CityPlan) -> None:
     within_a_street = gaps[gaps < 27]
     assert len(within_a_street) > 80
     assert within_a_street.min() > 13
-
-
-def test_queries_are_of_other_days_than_the_database(plan: CityPlan) -> None:
-    database = {shot.session.name for shot in of_role(plan, "database")}
-    queries = {shot.session.name for shot in of_role(plan, "query")}
-    assert len(database) == 2
-    assert len(queries) == 5
-    assert not database & queries
-
-
-def test_each_place_to_learn_from_has_four_sessions(plan: CityPlan) -> None:
-    sessions = defaultdict(set)
-    for shot in of_role(plan, "train"):
-        sessions[shot.place].add(shot.session.name)
-    assert len(sessions) == 150
-    assert all(len(names) >= 4 for names in sessions.values())
 
 
 def test_name_says_where_and_when_the_camera_stood(plan: CityPlan) -> None:

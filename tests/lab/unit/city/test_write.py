@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from lab.city import write
 from lab.city.plan import CityOptions, make_plan
-from lab.city.write import TrainingLayoutName, with_training_layout
-from lab.datasets.open_dataset import open_training_set
+from lab.evaluation.recall import positives_within, recall_at_k
 
 PLAN = make_plan(CityOptions(2, 4, 4, 1, 2, 0.25, 64, 64))
 
@@ -37,16 +40,21 @@ def test_bytes_do_not_depend_on_how_many_processes_draw(
     assert contents(tmp_path / "alone") == contents(tmp_path / "shared")
 
 
-def test_same_photos_can_be_laid_out_as_either_training_set(tmp_path: Path) -> None:
-    opened = {}
-    for layout in TrainingLayoutName:
-        write.write_city(with_training_layout(PLAN, layout), tmp_path / layout)
-        opened[layout] = open_training_set(tmp_path / layout)
-    xs, original = opened[TrainingLayoutName.GSV_XS], opened[TrainingLayoutName.GSV_CITIES]
-    assert (xs.layout, original.layout) == ("gsv_xs", "GSV-Cities")
-    assert [p.place_id for p in xs.places] == [p.place_id for p in original.places] == [0, 1]
-    for one, other in zip(xs.places, original.places, strict=True):
-        assert [p.read_bytes() for p in one.photos] == [p.read_bytes() for p in other.photos]
-    assert contents(tmp_path / TrainingLayoutName.GSV_XS / "queries") == contents(
-        tmp_path / TrainingLayoutName.GSV_CITIES / "queries"
+def test_average_colours_do_not_tell_places_apart() -> None:
+    plan = make_plan(CityOptions(80, 1, 40, 0, 0, 0.0, 64, 64, train=False))
+    renderer = write.PhotoRenderer(plan)
+
+    def colours_and_positions(role: str) -> list[np.ndarray[Any, np.dtype[np.float64]]]:
+        photos = [photo for photo in plan.photos if photo.role == role]
+        pixels = [Image.open(io.BytesIO(renderer.render(photo))) for photo in photos]
+        return [
+            np.array([np.asarray(each, float).mean(axis=(0, 1)) for each in pixels]),
+            np.array([(photo.camera.x, photo.camera.y) for photo in photos]),
+        ]
+
+    (queries, query_positions), (database, positions) = map(
+        colours_and_positions, ("query", "database")
     )
+    away = np.linalg.norm(queries[:, None] - database, axis=2)
+    positives = positives_within(query_positions, positions)
+    assert recall_at_k(np.argsort(away, axis=1), positives)[1] < 0.15

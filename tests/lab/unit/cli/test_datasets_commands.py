@@ -164,6 +164,6 @@ def test_audit_lists_confident_answers_just_outside_the_rule(tmp_path: Path) -> 
     assert suspect["score"] == pytest.approx(0.9)
     assert "1 of 2 queries" in called(*options)
     np.save(tmp_path / "p.npy", np.array([[1], [3]]))
-    assert run_datasets(*options, code=1)["code"] == "predictions_out_of_range"
+    assert run_datasets(*options, code=1)["code"] == "bad_predictions"
     np.save(tmp_path / "p.npy", np.array([0.5]))
     assert run_datasets(*options, code=1)["code"] == "bad_predictions"
