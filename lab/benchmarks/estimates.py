@@ -72,6 +72,7 @@ class DescribedPhotos:
     """(n,) clusters of the bootstrap"""
     scheme: LevelScheme
     radius_m: float
+    paths: Sequence[Path]
     match: MatchOwnPhoto | None = None
     """compares photos of the set; None for estimates without matches"""
 
@@ -177,6 +178,7 @@ def describe_set(folder: Path, progress: Progress) -> DescribedPhotos:
         cluster_queries(photos).labels,
         LevelScheme(labels_are_paths=is_path, radii_m=settings.level_radii_m),
         settings.estimate_radius_m,
+        [photo.path for photo in photos],
     )
 
 

@@ -1,0 +1,201 @@
+"""Matches of local features: their cost, and what they add to place estimates.
+
+    placewise bench matches [FOLDER...] [--detector xfeat] [--lightglue]
+
+Each folder is an evaluation set with coordinates or place labels; without one, it is the folder
+`tower` of PLACEWISE_TEST_DATA. Its descriptors and place models are those of `bench estimates`. The
+queries are estimated without matches, and with those of their first photos. Matched are mutual
+nearest neighbours, or LightGlue's matches.
+
+The peer is the same with kornia's functions in a loop: its mutual nearest neighbours and its RANSAC
+of the fundamental matrix. CPU times are those of one thread.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+from PIL import Image, ImageOps
+
+from lab.benchmarks.estimates import (
+    DescribedPhotos,
+    Judged,
+    add_judged,
+    describe_set,
+    fit_and_judge,
+    left_out_labels,
+)
+from lab.benchmarks.report import Report, printed_report
+from services.cli.output import JsonOption, Table
+from shared.errors import Misconfigured
+from shared.evaluation.places.evidence import match_support
+from shared.matching.detectors import Detector, detect_features, load_detector
+from shared.matching.features import WORKING_SIDE, LocalFeatures
+from shared.matching.lightglue import LightGlueMatcher
+from shared.matching.matchers import Matcher, MutualNearest
+from shared.matching.verification import (
+    MAX_EPIPOLAR_ERROR_PIXELS,
+    MAX_ITERATIONS,
+    verify_matches,
+)
+
+PEER_PAIRS = 100
+MAX_FEATURES_MS = 70.0
+MAX_PAIR_MS = 12.0
+MAX_XFEAT_BYTES = 80_000
+
+
+class MatchedPhotos:
+    """Local features of the photos of a set, and the match support of pairs, each computed once."""
+
+    def __init__(self, features: Sequence[LocalFeatures], matcher: Matcher) -> None:
+        self.features = features
+        self.matcher = matcher
+        self.match_seconds = self.verify_seconds = 0.0
+        """CPU time of all pairs"""
+        self.supports: dict[tuple[int, int], float] = {}
+
+    def match(self, photo: int, others: Sequence[Any]) -> list[float | None]:
+        """Return the match support of a photo with each of others."""
+        return [self._support(*sorted((photo, other))) for other in others]
+
+    def _support(self, first: int, second: int) -> float:
+        pair = first, second
+        if pair not in self.supports:
+            a, b = self.features[first], self.features[second]
+            started = time.process_time()
+            matches = self.matcher.match(a, b)
+            matched = time.process_time()
+            points = a.working_pixels()[matches[:, 0]], b.working_pixels()[matches[:, 1]]
+            inliers = int(verify_matches(*points).sum())
+            self.match_seconds += matched - started
+            self.verify_seconds += time.process_time() - matched
+            self.supports[pair] = match_support(len(matches), inliers)
+        return self.supports[pair]
+
+
+def bench(
+    folders: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Evaluation sets with coordinates or places. Default: tower in "
+            "PLACEWISE_TEST_DATA.",
+            exists=True,
+        ),
+    ] = None,
+    detector: Annotated[str, typer.Option(help="xfeat or aliked-n16.")] = "xfeat",
+    lightglue: Annotated[bool, typer.Option(help="Match with LightGlue.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure the cost of local features, and what their matches add to place estimates."""
+    if not folders and "PLACEWISE_TEST_DATA" not in os.environ:
+        raise Misconfigured(
+            "no_data_set", "Name an evaluation set, or the folder of tower/ in PLACEWISE_TEST_DATA."
+        )
+    device = torch.device("cpu")
+    loaded = load_detector(detector, device)
+    matcher: Matcher = MutualNearest.of_model(loaded.model)
+    if lightglue:
+        matcher = LightGlueMatcher(detector, device)
+    name = f"{loaded.model}, {'LightGlue' if lightglue else 'mutual nearest'}"
+    with printed_report(f"matches of {name}", as_json) as (report, progress):
+        for folder in folders or [Path(os.environ["PLACEWISE_TEST_DATA"]) / "tower"]:
+            photos = describe_set(folder, progress)
+            bar = progress.add_task(f"{photos.name}: local features", total=len(photos.paths))
+            features, seconds = detect_all(loaded, photos.paths, partial(progress.advance, bar))
+            matched = MatchedPhotos(features, matcher)
+            compare(report, photos, matched)
+            add_cost(report, photos.name, matched, seconds)
+            add_peer(report, photos.name, matched)
+
+
+def detect_all(
+    detector: Detector, paths: Sequence[Path], on_photo: Callable[[], object]
+) -> tuple[list[LocalFeatures], float]:
+    """Return the local features of photos, and the CPU seconds of their detection."""
+    torch.set_num_threads(1)
+    features, seconds = [], 0.0
+    for path in paths:
+        with Image.open(path) as image:
+            upright = ImageOps.exif_transpose(image).convert("RGB")
+        scale = min(1.0, WORKING_SIDE / max(upright.size))
+        size = (round(upright.width * scale), round(upright.height * scale))
+        pixels = np.array(upright.resize(size, Image.Resampling.BILINEAR, reducing_gap=2.0))
+        started = time.process_time()
+        features.append(detect_features(detector, pixels, upright.size))
+        seconds += time.process_time() - started
+        on_photo()
+    return features, seconds
+
+
+def compare(report: Report, photos: DescribedPhotos, matched: MatchedPhotos) -> None:
+    """Report the estimates of the set's queries without and with matches."""
+    table = Table("estimates", "R@1", "answered", "at the finest level", "right", title=photos.name)
+    for name, tried in (("without", photos), ("with", replace(photos, match=matched.match))):
+        judged = fit_and_judge(tried, ~photos.is_query, photos.is_query)
+        what = f"{photos.name}, {name} matches"
+        recall = _percent(j.is_right[0] is True for j in judged)
+        report.add(f"{what}: right at the finest level", recall, "%")
+        add_judged(report, what, judged)
+        known = [j for j in judged if j.is_answer_right is not None]
+        table.add_row(
+            name,
+            f"{recall:.1f}",
+            f"{_percent(j.estimate.answer is not None for j in judged):.1f}",
+            f"{_percent(j.is_finest for j in judged):.1f}",
+            f"{_percent(j.is_answer_right for j in known):.1f}",
+        )
+        left_out: list[Judged] = []
+        for missing in left_out_labels(photos):
+            left_out += fit_and_judge(tried, ~photos.is_query & ~missing, missing)
+        if left_out:
+            finest = _percent(j.is_finest for j in left_out)
+            report.add(f"{what}, labels left out: at the finest level", finest, "%", at_most=5)
+    report.tables.append(table)
+
+
+def add_cost(report: Report, name: str, matched: MatchedPhotos, seconds: float) -> None:
+    """Report CPU times and bytes of the photos and pairs of a set."""
+    photos, pairs = len(matched.features), max(1, len(matched.supports))
+    size = np.mean([len(features.encode()) for features in matched.features])
+    pair_ms = 1000 * (matched.match_seconds + matched.verify_seconds) / pairs
+    match_ms = 1000 * matched.match_seconds / pairs
+    report.add(f"{name}: CPU a photo", 1000 * seconds / photos, "ms", at_most=MAX_FEATURES_MS)
+    report.add(f"{name}: bytes a photo", float(size), "B", at_most=MAX_XFEAT_BYTES)
+    report.add(f"{name}: CPU a pair", pair_ms, "ms", at_most=MAX_PAIR_MS)
+    report.add(f"{name}: CPU a pair, matching alone", match_ms, "ms")
+
+
+def add_peer(report: Report, name: str, matched: MatchedPhotos) -> None:
+    """Report the CPU time of a pair with kornia's matching and RANSAC."""
+    from kornia.feature import match_mnn
+    from kornia.geometry import RANSAC
+
+    torch.manual_seed(0)
+    ransac = RANSAC("fundamental", MAX_EPIPOLAR_ERROR_PIXELS, max_iter=MAX_ITERATIONS // 10)
+    pairs = list(matched.supports)[:PEER_PAIRS]
+    started = time.process_time()
+    for pair in pairs:
+        tensors = [matched.features[photo] for photo in pair]
+        descriptors = [torch.from_numpy(f.descriptors.astype(np.float32)) for f in tensors]
+        points = [torch.from_numpy(f.working_pixels().astype(np.float32)) for f in tensors]
+        _, indices = match_mnn(*descriptors)
+        if len(indices) >= 8:
+            ransac(points[0][indices[:, 0]], points[1][indices[:, 1]])
+    if pairs:
+        elapsed_ms = 1000 * (time.process_time() - started) / len(pairs)
+        report.add(f"{name}: CPU a pair, kornia in a loop", elapsed_ms, "ms")
+
+
+def _percent(counted: Any) -> float:
+    values = list(counted)
+    return 100.0 * sum(values) / max(1, len(values))
