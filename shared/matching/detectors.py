@@ -13,11 +13,14 @@ from functools import cache
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from shared.errors import Misconfigured
 from shared.matching.features import MIN_SIDE, LocalFeatures
+
+MIN_CONTRAST = 1.0  # standard deviation of the samples, from 0 to 255
 
 DETECTORS = {
     "xfeat": "shared.matching.xfeat:XFeatDetector",
@@ -35,7 +38,7 @@ class Detector(Protocol):
     dimension: int
     """of a descriptor"""
 
-    def detect(self, pixels: NDArray, size: tuple[int, int]) -> LocalFeatures:
+    def detect(self, pixels: NDArray[np.uint8], size: tuple[int, int]) -> LocalFeatures:
         """Return the local features of a photo.
 
         Args:
@@ -44,9 +47,15 @@ class Detector(Protocol):
         """
 
 
-def detect_features(detector: Detector, pixels: NDArray, size: tuple[int, int]) -> LocalFeatures:
-    """Return the local features of a photo as `Detector.detect`; none of a photo below MIN_SIDE."""
-    if max(size) < MIN_SIDE:
+def detect_features(
+    detector: Detector, pixels: NDArray[np.uint8], size: tuple[int, int]
+) -> LocalFeatures:
+    """Return the local features of a photo as `Detector.detect`.
+
+    Photos below MIN_SIDE have none, and neither have those of one colour: some detectors would find
+    keypoints in any photo.
+    """
+    if max(size) < MIN_SIDE or pixels.std() < MIN_CONTRAST:
         return LocalFeatures.empty(size, detector.dimension)
     return detector.detect(pixels, size)
 

@@ -1,0 +1,172 @@
+"""Every detector of local features, and every matcher, on a photograph and a turned copy of it."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from skimage import data
+
+from shared.errors import Misconfigured
+from shared.matching.detectors import (
+    DETECTORS,
+    Detector,
+    detect_features,
+    load_detector,
+    load_tensors,
+    read_package_weights,
+)
+from shared.matching.features import FULL_SIDE, MAX_KEYPOINTS, LocalFeatures
+from shared.matching.lightglue import LightGlueMatcher
+from shared.matching.matchers import Matcher, MutualNearest
+from shared.matching.verification import verify_matches
+
+CPU = torch.device("cpu")
+ANGLE_DEGREES = 8.0
+SIDE = 512
+
+
+def photograph() -> Image.Image:
+    return Image.fromarray(data.astronaut())
+
+
+def turned() -> Image.Image:
+    return photograph().rotate(ANGLE_DEGREES, Image.Resampling.BICUBIC)
+
+
+def turn(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where `turned` shows points of the photograph."""
+    radians, middle = math.radians(ANGLE_DEGREES), SIDE / 2
+    x, y = (points - middle).T
+    cosine, sine = math.cos(radians), math.sin(radians)
+    return np.column_stack([cosine * x + sine * y, -sine * x + cosine * y]) + middle
+
+
+@cache
+def detector_of(name: str) -> Detector:
+    return load_detector(name, CPU)
+
+
+@cache
+def features_of(name: str, is_turned: bool = False) -> LocalFeatures:
+    image = turned() if is_turned else photograph()
+    return detect_features(detector_of(name), np.array(image), image.size)
+
+
+@pytest.mark.parametrize("name", DETECTORS)
+class TestDetector:
+    def test_keypoints_have_unit_descriptors_of_the_detectors_dimension(self, name: str) -> None:
+        features = features_of(name)
+        count, dimension = features.descriptors.shape
+        assert 500 < count <= MAX_KEYPOINTS
+        assert dimension == detector_of(name).dimension
+        lengths = np.linalg.norm(features.descriptors.astype(float), axis=1) / 127
+        np.testing.assert_allclose(lengths, 1, atol=0.03)
+        assert features.positions.max() <= FULL_SIDE
+        assert (features.width, features.height) == (SIDE, SIDE)
+
+    def test_features_of_a_photo_take_at_most_140_kilobytes_and_survive_encoding(
+        self, name: str
+    ) -> None:
+        features = features_of(name)
+        encoded = features.encode()
+        assert len(encoded) <= 16 + MAX_KEYPOINTS * (4 + detector_of(name).dimension) <= 140_000
+        decoded = LocalFeatures.decode(encoded)
+        np.testing.assert_array_equal(decoded.positions, features.positions)
+        np.testing.assert_array_equal(decoded.descriptors, features.descriptors)
+
+    @pytest.mark.parametrize("pixels", [np.zeros((8, 8, 3)), np.full((480, 640, 3), 200)])
+    def test_a_tiny_photo_and_one_without_texture_have_no_keypoints(
+        self, name: str, pixels: NDArray[np.float64]
+    ) -> None:
+        image = pixels.astype(np.uint8)
+        found = detect_features(detector_of(name), image, (image.shape[1], image.shape[0]))
+        assert found.descriptors.shape == (0, detector_of(name).dimension)
+
+    def test_the_model_is_named_by_the_detector_and_the_hash_of_its_weights(
+        self, name: str
+    ) -> None:
+        detector, _, sha256 = detector_of(name).model.partition("@")
+        assert (detector, len(sha256)) == (name, 12)
+
+
+MATCHERS = [
+    pytest.param("xfeat", "mutual nearest", id="xfeat-mutual-nearest"),
+    pytest.param("xfeat", "LightGlue", id="xfeat-lightglue"),
+    pytest.param("aliked-n16", "mutual nearest", id="aliked-mutual-nearest"),
+    pytest.param("aliked-n16", "LightGlue", id="aliked-lightglue"),
+]
+
+
+@cache
+def matcher_of(detector: str, kind: str) -> Matcher:
+    if kind == "LightGlue":
+        return LightGlueMatcher(detector, CPU)
+    return MutualNearest.of_model(detector_of(detector).model)
+
+
+@pytest.mark.parametrize(("detector", "kind"), MATCHERS)
+class TestMatcher:
+    def test_verified_matches_show_the_same_points(self, detector: str, kind: str) -> None:
+        first, second = features_of(detector), features_of(detector, is_turned=True)
+        matches = matcher_of(detector, kind).match(first, second)
+        points = [first.working_pixels()[matches[:, 0]], second.working_pixels()[matches[:, 1]]]
+        inliers = verify_matches(*points)
+        assert inliers.sum() >= 100
+        right = first.pixels()[matches[inliers, 0]], second.pixels()[matches[inliers, 1]]
+        errors = np.linalg.norm(turn(right[0]) - right[1], axis=1)
+        assert np.mean(errors < 3) > 0.9
+
+    def test_each_keypoint_is_matched_at_most_once(self, detector: str, kind: str) -> None:
+        first, second = features_of(detector), features_of(detector, is_turned=True)
+        matches = matcher_of(detector, kind).match(first, second)
+        for column in matches.T:
+            assert len(set(column.tolist())) == len(matches)
+
+    def test_a_photo_without_keypoints_matches_nothing(self, detector: str, kind: str) -> None:
+        features = features_of(detector)
+        empty = LocalFeatures.empty((64, 48), features.descriptors.shape[1])
+        matcher = matcher_of(detector, kind)
+        assert matcher.match(features, empty).shape == (0, 2)
+        assert matcher.match(empty, features).shape == (0, 2)
+
+
+def test_fewer_matches_than_a_fundamental_matrix_takes_have_no_inliers() -> None:
+    points = np.random.default_rng(0).uniform(0, 640, (7, 2))
+    assert not verify_matches(points, points + 3).any()
+
+
+def test_points_that_move_at_random_have_few_inliers() -> None:
+    rng = np.random.default_rng(0)
+    inliers = verify_matches(rng.uniform(0, 640, (200, 2)), rng.uniform(0, 640, (200, 2)))
+    assert inliers.sum() < 40
+
+
+def test_an_unknown_detector_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(Misconfigured, match=r"LOCAL_FEATURES is one of: xfeat, aliked-n16"):
+        load_detector("sift", CPU)
+
+
+def test_missing_weights_name_the_extra_that_installs_them() -> None:
+    with pytest.raises(Misconfigured, match=r"'\.\[lightglue\]'"):
+        read_package_weights("scm_no_such_package", "weights.pth", "lightglue")
+
+
+@pytest.mark.parametrize(
+    "state", [{}, {"weight": torch.zeros(3, 3), "bias": torch.zeros(2), "other": torch.zeros(1)}]
+)
+def test_weights_that_do_not_fit_are_refused(state: dict[str, torch.Tensor]) -> None:
+    with pytest.raises(Misconfigured) as caught:
+        load_tensors(torch.nn.Linear(2, 2), state)
+    assert caught.value.code == "weights_unusable"
+
+
+@pytest.mark.parametrize("data", [b"", bytes(15), bytes(16), b"\1" * 40])
+def test_damaged_features_are_no_features(data: bytes) -> None:
+    with pytest.raises(ValueError, match="bytes"):
+        LocalFeatures.decode(data)
