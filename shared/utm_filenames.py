@@ -8,7 +8,6 @@ heading @ pitch @ roll @ height @ timestamp @ note @ .jpg`; only the first two a
 from __future__ import annotations
 
 import contextlib
-import math
 from datetime import UTC, datetime
 
 import utm
@@ -17,23 +16,6 @@ from shared.errors import InvalidRequest
 
 FIELDS = 16  # 14 between the first and the last `@`; splitting gives two more
 FULL_DATES = {8: "%Y%m%d", 14: "%Y%m%d%H%M%S"}  # by length; a year or a month alone is not a date
-
-
-def utm_position_of_file_name(name: str) -> tuple[float, float] | None:
-    """Parse UTM east and north, in metres, of an `@UTM@` file name; None for other names.
-
-    Raises InvalidRequest (`bad_coordinates`) if they are not finite numbers.
-    """
-    parts = name.split("@")
-    if len(parts) < 4 or parts[0]:
-        return None
-    try:
-        east, north = float(parts[1]), float(parts[2])
-        if not math.isfinite(east + north):
-            raise ValueError(f"{parts[1]} and {parts[2]} are not finite numbers")
-    except ValueError as error:
-        raise _bad_coordinates(name, error) from error
-    return east, north
 
 
 def upload_fields_of_file_name(name: str, utm_zone: str | None) -> dict[str, str]:
@@ -59,7 +41,7 @@ def upload_fields_of_file_name(name: str, utm_zone: str | None) -> dict[str, str
         try:
             degrees = utm_to_degrees(float(east), float(north), int(zone[:-1]), zone[-1].upper())
         except (ValueError, utm.OutOfRangeError) as error:
-            raise _bad_coordinates(name, error) from error
+            raise bad_coordinates_error(name, error) from error
         latitude, longitude = f"{degrees[0]:.7f}", f"{degrees[1]:.7f}"
     fields = {"latitude": latitude, "longitude": longitude}
     with contextlib.suppress(ValueError):  # the heading is optional in the convention
@@ -87,7 +69,7 @@ def parse_full_date(timestamp: str) -> datetime | None:
         return None
 
 
-def _bad_coordinates(name: str, error: Exception) -> InvalidRequest:
+def bad_coordinates_error(name: str, error: Exception) -> InvalidRequest:
     return InvalidRequest(
         "bad_coordinates", f"{name}: its UTM coordinates can't be read ({error})."
     )

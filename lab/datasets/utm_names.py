@@ -8,8 +8,8 @@ from datetime import datetime
 
 from shared.utm_filenames import (
     FIELDS,
+    bad_coordinates_error,
     parse_full_date,
-    utm_position_of_file_name,
     utm_to_degrees,
 )
 
@@ -82,14 +82,20 @@ def parse_utm_file_name(name: str) -> FileNameLocation | None:
 
     `name` is the file name without folders. Raises InvalidRequest (`bad_coordinates`).
     """
-    position = utm_position_of_file_name(name)
-    if position is None:
-        return None
     parts = name.split("@")
+    if len(parts) < 4 or parts[0]:
+        return None
+    try:
+        east, north = float(parts[1]), float(parts[2])
+        if not math.isfinite(east + north):
+            raise ValueError(f"{parts[1]} and {parts[2]} are not finite numbers")
+    except ValueError as error:
+        raise bad_coordinates_error(name, error) from error
     parts += [""] * (FIELDS - len(parts))
     number, letter, latitude, longitude = parts[3:7]
     return FileNameLocation(
-        *position,
+        east,
+        north,
         zone=f"{number}{letter}" if number and letter else None,
         latitude=_number(latitude) if longitude else None,
         longitude=_number(longitude) if latitude else None,

@@ -11,7 +11,7 @@ import importlib
 import json
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +23,10 @@ from lab.training.run_control import Display
 from shared.descriptors.aggregators import AGGREGATORS
 from shared.descriptors.aggregators.base import Aggregator
 from shared.descriptors.vpr_models.backbones import register_backbone
-from shared.descriptors.vpr_models.checkpoint import is_checkpoint, load_checkpoint
+from shared.descriptors.vpr_models.checkpoint import load_checkpoint
 from shared.descriptors.vpr_models.config import VprModelConfig, is_own_module
 from shared.descriptors.vpr_models.model import VprModel, build_vpr_model
+from shared.descriptors.weight_files import TENSOR_READ_ERRORS, load_tensors
 from shared.errors import Conflict, InvalidRequest, Misconfigured
 
 
@@ -90,7 +91,19 @@ def _initial_checkpoint(arguments: TrainingArguments) -> Path | None:
     if arguments.model_path is not None:
         return arguments.model_path
     weights = arguments.weights if arguments.pretrained else None
-    return weights if weights is not None and is_checkpoint(weights) else None
+    return weights if weights is not None and _is_checkpoint(weights) else None
+
+
+def _is_checkpoint(path: Path) -> bool:
+    """Whether a file has the tensors of a VPR model, and not those of a backbone alone."""
+    try:
+        stored = load_tensors(path)
+    except TENSOR_READ_ERRORS:
+        return False
+    return isinstance(stored, Mapping) and (
+        not {"state_dict", "model_state_dict"}.isdisjoint(stored)
+        or any(str(name).startswith("backbone.") for name in stored)
+    )
 
 
 def _check_same_network(path: Path, stored: VprModelConfig, described: VprModelConfig) -> None:

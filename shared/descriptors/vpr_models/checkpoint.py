@@ -104,18 +104,6 @@ def load_checkpoint(path: Path) -> Checkpoint:
     return Checkpoint(model, model.config, model_fingerprint(model), about)
 
 
-def is_checkpoint(path: Path) -> bool:
-    """Whether a file has the tensors of a VPR model, and not those of a backbone alone."""
-    try:
-        stored = load_tensors(path)
-    except TENSOR_READ_ERRORS:
-        return False
-    return isinstance(stored, Mapping) and (
-        not {"state_dict", "model_state_dict"}.isdisjoint(stored)
-        or any(str(name).startswith("backbone.") for name in stored)
-    )
-
-
 def checkpoint_state(model: VprModel, **about: Any) -> dict[str, Any]:
     """Return the checkpoint of a model, for `torch.save`; `load_checkpoint` reads it.
 

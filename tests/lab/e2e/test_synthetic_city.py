@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from shared.utm_filenames import upload_fields_of_file_name, utm_position_of_file_name
+from lab.datasets.utm_names import parse_utm_file_name
+from shared.utm_filenames import upload_fields_of_file_name
 from tests.support.server import environment, run_command
 
 SMALL = ("--places", "12", "--queries", "10", "--size", "96x72")
@@ -103,10 +104,9 @@ def test_gsv_xs_table_names_its_photos_by_place(out: Path) -> None:
     for row in rows:
         # As the field's own tools read it: the place stands before the `_` of the note.
         assert int(row["filename"].split("@")[-2].split("_")[0]) == int(row["place_id"])
-        assert utm_position_of_file_name(row["filename"]) == (
-            float(row["UTMx"]),
-            float(row["UTMy"]),
-        )
+        location = parse_utm_file_name(row["filename"])
+        assert location is not None
+        assert (location.east, location.north) == (float(row["UTMx"]), float(row["UTMy"]))
     assert min([row["place_id"] for row in rows].count(str(p)) for p in range(12)) >= 4
 
 

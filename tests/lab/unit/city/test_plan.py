@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from lab.city.plan import CityOptions, CityPlan, PlannedPhoto, make_plan
+from lab.datasets.utm_names import parse_utm_file_name
 from lab.evaluation.recall import positives_within
-from shared.utm_filenames import upload_fields_of_file_name, utm_position_of_file_name
+from shared.utm_filenames import upload_fields_of_file_name
 
 OPTIONS = CityOptions(
     places=150, views=4, queries=120, seed=5, catalogue_seed=0, out_of_map=0.2, width=64, height=64
@@ -75,7 +76,9 @@ def test_name_says_where_and_when_the_camera_stood(plan: CityPlan) -> None:
     names = [shot.name for shot in plan.photos]
     assert len(set(names)) == len(names)
     for shot in plan.photos[::17]:
-        assert utm_position_of_file_name(shot.name) == (shot.camera.x, shot.camera.y)
+        location = parse_utm_file_name(shot.name)
+        assert location is not None
+        assert (location.east, location.north) == (shot.camera.x, shot.camera.y)
         fields = upload_fields_of_file_name(shot.name, None)
         assert float(fields["heading"]) == pytest.approx(shot.camera.yaw, abs=0.006)
         assert fields["captured_at"].startswith(shot.session.starts_at.date().isoformat())
