@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from ipaddress import ip_network
 from typing import Self
@@ -104,8 +105,8 @@ class GatewaySettings(BaseSettings):
         200_000,
         ge=1,
         description="queued jobs at which requests that create further jobs are rejected; one map "
-        "may have half of them, so that a batch has at most as many photos, and query photos may "
-        "be a 200th",
+        "may have half of them, so that a batch has at most as many photos; in addition, a 200th "
+        "as many query photos may wait, but at least 10",
     )
     max_concurrent_uploads: int = Field(
         32,
@@ -195,12 +196,12 @@ class GatewaySettings(BaseSettings):
     @property
     def max_queued_queries(self) -> int:
         """Queued query photos, without uploads: their callers wait, so fewer than other jobs."""
-        return max(1, self.max_queued_jobs // 200)
+        return max(10, self.max_queued_jobs // 200)
 
     @property
     def max_batch_photos(self) -> int:
         """Photos of one batch, which become jobs of one map."""
-        return self.max_queued_jobs // 2
+        return math.ceil(self.max_queued_jobs / 2)
 
     @property
     def tile_attribution(self) -> str | None:

@@ -118,11 +118,12 @@ def test_all_maps_together_have_a_limit_and_queries_pass_it(
 
 
 def test_queries_have_a_limit_of_their_own_and_uploads_pass_it(make_service: Make) -> None:
-    service = make_service(max_queued_jobs=200)
-    service.ask(near_copy(1))
-    files = {"file": ("query.jpg", near_copy(2))}
+    service = make_service(max_queued_jobs=2)
+    for number in range(10):
+        service.ask(near_copy(number))
+    files = {"file": ("query.jpg", near_copy(10))}
     body = queue_full(service("POST", "/similarity", files=files))
-    assert body["limit"] == 1
+    assert body["limit"] == 10
     assert upload(service, 1).status_code == 202
 
 
@@ -338,13 +339,13 @@ def test_health_says_how_full_things_are(
 ) -> None:
     receiving = {UploadKind.UPLOAD: 3, UploadKind.QUERY: 2}
     monkeypatch.setattr(AdmissionControl, "active_uploads", lambda _, kind: receiving[kind])
-    service = make_service(max_queued_jobs=1400)
+    service = make_service(max_queued_jobs=2200)
     with catalog.write() as session:
         city = get_map(session, "city").id
         session.add(Job(map_id=city, kind=JobKind.INDEX, priority=Priority.UPLOAD))
     service.ask(near_copy(1))
     load = service.json("GET", "/health")["load"]
-    assert (load["waiting_jobs"], load["max_queued_jobs"]) == (1, 1400)
-    assert (load["waiting_queries"], load["max_queued_queries"]) == (1, 7)
+    assert (load["waiting_jobs"], load["max_queued_jobs"]) == (1, 2200)
+    assert (load["waiting_queries"], load["max_queued_queries"]) == (1, 11)
     assert (load["receiving_uploads"], load["receiving_queries"]) == (3, 2)
     assert load["free_bytes"] > 0

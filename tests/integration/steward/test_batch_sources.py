@@ -201,7 +201,7 @@ def test_limits_of_a_batch_are_reported_and_leave_nothing(
     settings: Settings,
     make_worker: Callable[[], ExtractorWorker],
 ) -> None:
-    small = settings.model_copy(update={"max_queued_jobs": 4})
+    small = settings.model_copy(update={"max_queued_jobs": 20})
     with catalog.write() as session:
         get_or_create_default_map(session, settings.extractor)
     service = Service(catalog, store, small, make_worker)
@@ -211,10 +211,10 @@ def test_limits_of_a_batch_are_reported_and_leave_nothing(
         assert list(store.list("")) == []
         return str(problem(answer, 413, answer.json()["code"])["code"])
 
-    tiny = [("file", (f"{n}.jpg", b"\xff\xd8\xff")) for n in range(3)]
+    tiny = [("file", (f"{n}.jpg", b"\xff\xd8\xff")) for n in range(11)]
     assert refused(files=tiny) == "too_many_photos"
     assert refused(files=tiny, headers={"Content-Length": "20000000000"}) == "batch_too_large"
-    keys = lines(*({"key": f"imports/{n}.jpg"} for n in range(3)))
+    keys = lines(*({"key": f"imports/{n}.jpg"} for n in range(11)))
     headers = {"Content-Type": "application/x-ndjson"}
     assert refused(content=keys, headers=headers) == "too_many_photos"
     problem(service("POST", "/upload/batch?map=nope", content=keys[:20]), 400, "no_file")
