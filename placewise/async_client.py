@@ -419,15 +419,19 @@ class AsyncClient(AsyncTransport):
         generation_id: Id,
         file: BinaryIO,
         on_received: Callable[[int], object] = lambda received_bytes: None,
+        *,
+        features: bool = False,
     ) -> None:
         """Download a tar with `descriptors.npy`, `names.txt` and `photos.csv` into a file.
+
+        With `features`, the tar also has the local features, `local.features`.
 
         Args:
             file: Seekable and writable; overwritten from its beginning.
             on_received: Called with the number of bytes received so far.
         """
         path = f"/generations/{generation_id}/descriptors"
-        await self._download(path, file, on_received)
+        await self._download(path, file, on_received, **({"features": True} if features else {}))
 
     async def learn_word_weights(self, /, generation_id: Id, **options: int) -> answers.Started:
         """Start fitting word weights of the active generation; options are `sample` and `seed`."""

@@ -94,8 +94,10 @@ class AsyncTransport:
                 headers=upload["headers"],
             )
 
-    async def _receive(self, url: str, write: Callable[[bytes], object]) -> httpx2.Response:
-        async with self._http.stream("GET", url) as response:
+    async def _receive(
+        self, url: str, write: Callable[[bytes], object], **options: Any
+    ) -> httpx2.Response:
+        async with self._http.stream("GET", url, **options) as response:
             if response.is_success:
                 async for chunk in response.aiter_bytes(CHUNK_BYTES):
                     write(chunk)
@@ -163,7 +165,7 @@ class AsyncTransport:
                 return
 
     async def _download(
-        self, path: str, file: BinaryIO, on_received: Callable[[int], object]
+        self, path: str, file: BinaryIO, on_received: Callable[[int], object], **params: bool
     ) -> None:
         """Stream a response into a file, which is truncated before each attempt."""
 
@@ -174,7 +176,7 @@ class AsyncTransport:
         async def attempt() -> None:
             file.seek(0)
             file.truncate()
-            await self._check(self._receive(f"{API}{path}", write))
+            await self._check(self._receive(f"{API}{path}", write, params=params))
 
         await self._retry(attempt)
 

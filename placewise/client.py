@@ -41,8 +41,10 @@ class _BlockingCalls(AsyncClient):
                 upload["method"], upload["url"], content=file, headers=upload["headers"]
             )
 
-    async def _receive(self, url: str, write: Callable[[bytes], object]) -> httpx2.Response:
-        with self._blocking_http.stream("GET", url) as response:
+    async def _receive(
+        self, url: str, write: Callable[[bytes], object], **options: Any
+    ) -> httpx2.Response:
+        with self._blocking_http.stream("GET", url, **options) as response:
             if response.is_success:
                 for chunk in response.iter_bytes(CHUNK_BYTES):
                     write(chunk)

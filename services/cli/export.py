@@ -34,6 +34,7 @@ from services.cli.output import (
 from shared.errors import Conflict, InvalidRequest
 
 EXPORTED_FILES = ("photos.csv", "names.txt", "descriptors.npy")
+FEATURES_FILE = "local.features"
 PHOTO_PROPERTIES = {
     "original_filename",
     "relative_path",
@@ -70,6 +71,9 @@ def descriptors(
         UUID | None,
         typer.Option(metavar="ID", help="Generation to export. Default: the active one."),
     ] = None,
+    features: Annotated[
+        bool, typer.Option("--features", help="Also export local features: local.features.")
+    ] = False,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
@@ -87,11 +91,14 @@ def descriptors(
             out.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=out) as received:
                 client.export_descriptors(
-                    generation, received, lambda size: progress.update(receiving, completed=size)
+                    generation,
+                    received,
+                    lambda size: progress.update(receiving, completed=size),
+                    features=features,
                 )
                 received.seek(0)
                 with tarfile.open(fileobj=received, mode="r:") as tar:
-                    for name in EXPORTED_FILES:
+                    for name in (*EXPORTED_FILES, *([FEATURES_FILE] if features else [])):
                         member = tar.extractfile(name)
                         assert member is not None, "the archive contains regular files"
                         with member, atomic_write(out / name) as file:

@@ -68,11 +68,16 @@ class FeatureRows:
 
 def encode_feature_file(features: FeatureRows) -> bytes:
     """Encode a feature file."""
-    rows = features.rows
-    header = json.dumps({"format": 1, "model": features.model, "rows": len(rows)}).encode()
+    index = encode_feature_index(features.model, list(map(len, features.rows)))
+    return b"".join([index, *features.rows])
+
+
+def encode_feature_index(model: str, sizes: Sequence[int]) -> bytes:
+    """Encode the start of a feature file whose rows have these sizes in bytes."""
+    header = json.dumps({"format": 1, "model": model, "rows": len(sizes)}).encode()
     start = _START.pack(MAGIC, len(header)) + header
-    offsets = np.cumsum([len(start) + 8 * (len(rows) + 1), *map(len, rows)])
-    return b"".join([start, offsets.astype("<u8").tobytes(), *rows])
+    offsets = np.cumsum([len(start) + 8 * (len(sizes) + 1), *sizes])
+    return start + offsets.astype("<u8").tobytes()
 
 
 def read_feature_index(store: ObjectStore, key: str) -> FeatureIndex:
