@@ -7,9 +7,11 @@ import csv
 import io
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import utm
 from PIL import Image
 
 from lab.datasets.dataset import EvaluationSet
@@ -57,6 +59,37 @@ def save_lists(path: Path, rows: Sequence[Sequence[int]]) -> Path:
         lists[number] = list(row)
     np.save(path, lists, allow_pickle=True)
     return path
+
+
+def msls_city(folder: Path, photos: list[dict[str, Any]]) -> None:
+    """The four tables as Mapillary writes them; `m` is metres east of the city's corner."""
+
+    def write(name: str, header: tuple[str, ...], cells: Any) -> None:
+        table = [(number, *cells(photo)) for number, photo in enumerate(photos)]
+        write_csv(folder / name, ("", *header), table)
+
+    def degrees(photo: dict[str, Any]) -> tuple[float, float]:
+        latitude, longitude = utm.to_latlon(350_000 + photo["m"], 6_170_000, 33, "U")
+        return float(longitude), float(latitude)
+
+    write(
+        "raw.csv",
+        ("key", "lon", "lat", "ca", "captured_at", "pano"),
+        lambda p: (p["key"], *degrees(p), 370.0, "2019-01-01", p.get("pano", False)),
+    )
+    # Metres as if the city lay 7 m further east: only the official protocol uses them.
+    write(
+        "postprocessed.csv",
+        ("key", "easting", "northing", "night", "view_direction"),
+        lambda p: (p["key"], 350_007.0 + p.get("official", p["m"]), 6_170_000.0, False, "Forward"),
+    )
+    write(
+        "seq_info.csv",
+        ("key", "sequence_key", "frame_number"),
+        lambda p: (p["key"], p.get("sequence", "s1"), p.get("frame", 4)),
+    )
+    write("subtask_index.csv", ("all", "s2w"), lambda p: (p.get("all", True), False))
+    write_photos(folder / "images", [f"{photo['key']}.jpg" for photo in photos])
 
 
 def pair(base: Path, database: list[float], queries: list[float]) -> None:

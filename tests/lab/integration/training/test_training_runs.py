@@ -32,27 +32,10 @@ from tests.lab.training_runs import (
     weights,
 )
 from tests.lab.unit.data_sets import refused
+from tests.lab.unit.training.test_own_modules import CODE
 
 Json = dict[str, Any]
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-OWN_CODE = """
-import torch
-from shared.descriptors.aggregators.base import Aggregator, normalise_rows
-
-def network(pretrained):
-    return torch.nn.Conv2d(3, 8, kernel_size=8, stride=8)
-
-class Strongest(Aggregator):
-    inferred = {"in_channels": "channels"}
-
-    def __init__(self, in_channels: int):
-        super().__init__(in_channels)
-
-    def forward(self, maps):
-        return normalise_rows(maps.amax((-2, -1)))
-"""
 
 
 def test_a_run_leaves_its_summary_configuration_and_checkpoints(whole: tuple[Path, Json]) -> None:
@@ -91,17 +74,6 @@ def test_the_best_checkpoints_are_named_by_their_figures_and_the_best_one_is_tes
     assert "optimizer_states" not in torch.load(path, weights_only=True)
     last = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
     assert last["optimizer_states"]
-
-
-def test_the_same_run_twice_gives_the_same_weights(
-    whole: tuple[Path, Json], places: Path, tmp_path: Path
-) -> None:
-    folder, report = whole
-    again = train(run_arguments(places, tmp_path))
-    assert [epoch["loss"] for epoch in again["epochs"]] == [
-        epoch["loss"] for epoch in report["epochs"]
-    ]
-    assert_same_weights(folder / "checkpoints/last.ckpt", Path(again["last"]))
 
 
 def test_tests_and_on_demand_validations_leave_predictions_that_evaluate_reads(
@@ -164,10 +136,10 @@ def test_the_trained_model_keeps_the_size_and_the_interpolation_of_its_validatio
 def test_own_code_is_trained_stopped_resumed_and_tested_by_its_name(
     places: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "own_walks.py").write_text(OWN_CODE)
+    (tmp_path / "own_walks.py").write_text(CODE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    backbone, aggregator = "own_walks:network", "own_walks:Strongest"
+    backbone, aggregator = "own_walks:small_network", "own_walks:Strongest"
     own: Json = {
         "backbone_arch": backbone,
         "layers_to_crop": [],
@@ -245,8 +217,6 @@ def test_a_fast_dev_run_leaves_nothing(places: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("others", "code", "expected"),
     [
-        ({"cities": "Nowhere"}, "city_missing", "Nowhere"),
-        ({"backbone_arch": "resnet19"}, "unknown_backbone", "resnet18"),
         ({"monitor": "other/R1"}, "unknown_metric", "known: "),
         ({"img_per_place": 4}, "bad_argument", "min_img_per_place"),
     ],

@@ -15,6 +15,7 @@ from scipy.io import savemat
 from lab.datasets.ground_truth_files import write_ground_truth
 from lab.datasets.open_dataset import evaluation_set_names, open_evaluation_set
 from tests.lab.unit.data_sets import (
+    msls_city,
     names,
     pair,
     refused,
@@ -353,33 +354,6 @@ def test_a_vpr_bench_ground_truth_of_other_photos_is_refused(
 ) -> None:
     with refused(code):
         open_evaluation_set(write_bench(tmp_path, truth))
-
-
-def msls_city(folder: Path, photos: list[dict[str, Any]]) -> None:
-    """The four tables as Mapillary writes them; `m` is metres east of the city's corner."""
-
-    def write(name: str, header: tuple[str, ...], cells: Any) -> None:
-        table = [(number, *cells(photo)) for number, photo in enumerate(photos)]
-        write_csv(folder / name, ("", *header), table)
-
-    def degrees(photo: dict[str, Any]) -> tuple[float, float]:
-        latitude, longitude = utm.to_latlon(350_000 + photo["m"], 6_170_000, 33, "U")
-        return float(longitude), float(latitude)
-
-    write(
-        "raw.csv",
-        ("key", "lon", "lat", "ca", "captured_at", "pano"),
-        lambda p: (p["key"], *degrees(p), 370.0, "2019-01-01", p.get("pano", False)),
-    )
-    # Metres as if the city lay 7 m further east: only the official protocol uses them.
-    write(
-        "postprocessed.csv",
-        ("key", "easting", "northing", "night", "view_direction"),
-        lambda p: (p["key"], 350_007.0 + p.get("official", p["m"]), 6_170_000.0, False, "Forward"),
-    )
-    write("seq_info.csv", ("key", "sequence_key", "frame_number"), lambda p: (p["key"], "s1", 4))
-    write("subtask_index.csv", ("all", "s2w"), lambda p: (p.get("all", True), False))
-    write_photos(folder / "images", [f"{photo['key']}.jpg" for photo in photos])
 
 
 @pytest.fixture

@@ -66,14 +66,6 @@ def test_rows_are_read_from_a_mapped_file(tmp_path: Any) -> None:
     assert found.indices.tolist() == full_product(queries, database, 5).tolist()
 
 
-def test_progress_ends_at_the_announced_total() -> None:
-    reported: list[tuple[int, int]] = []
-    rows = unit_rows(10, 4, 7)
-    exact_knn(rows, rows, 1, block_bytes=4 * 16, on_progress=lambda *step: reported.append(step))
-    assert reported[-1] == (100, 100)
-    assert [done for done, _ in reported] == sorted(done for done, _ in reported)
-
-
 @pytest.mark.skipif(has_faiss_gpu(), reason="faiss has a GPU here")
 def test_gpu_that_faiss_does_not_have_is_a_named_error() -> None:
     with refused("faiss_gpu_missing", "Omit --faiss-gpu"):

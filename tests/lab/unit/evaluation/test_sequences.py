@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import utm
 from PIL import Image
 
 from lab.city.plan import CityOptions, make_plan
@@ -26,7 +25,7 @@ from lab.evaluation.sequences import (
 )
 from shared.tracks.belief import TrackStatus
 from shared.tracks.motion import MOTION_MODELS
-from tests.lab.unit.data_sets import write_csv, write_photos
+from tests.lab.unit.data_sets import msls_city, write_csv, write_photos
 
 pytestmark = pytest.mark.numerics
 
@@ -98,32 +97,14 @@ def test_a_map_with_labels_only_is_followed_by_the_photos_of_its_labels(tmp_path
 def test_sequences_of_the_msls_layout_are_followed_by_their_frame_numbers(tmp_path: Path) -> None:
     views = np.random.default_rng(0).normal(size=(200, 24))
     for city, side in product(("cph", "sf"), ("database", "query")):
-        folder = tmp_path / "train_val" / city / side
         numbers = range(100) if city == "cph" else range(100, 200)
-        keys = [f"{number:03d}" for number in numbers]
-        metres = [(350_000.0 + 10 * number, 6_170_000.0) for number in numbers]
-        write_photos(folder / "images", [f"{key}.jpg" for key in keys])
-        places = [utm.to_latlon(*each, 33, "U") for each in metres]
-        tables: dict[str, tuple[tuple[str, ...], list[tuple[Any, ...]]]] = {
-            "raw.csv": (
-                ("key", "lon", "lat", "ca", "captured_at", "pano"),
-                [
-                    (k, b, a, 0.0, "2019-01-01", False)
-                    for k, (a, b) in zip(keys, places, strict=True)
-                ],
-            ),
-            "postprocessed.csv": (
-                ("key", "easting", "northing", "night", "view_direction"),
-                [(k, *each, False, "Forward") for k, each in zip(keys, metres, strict=True)],
-            ),
-            "seq_info.csv": (
-                ("key", "sequence_key", "frame_number"),
-                [(key, city + side, number) for number, key in enumerate(keys)],
-            ),
-            "subtask_index.csv": (("key", "all", "s2w"), [(key, True, False) for key in keys]),
-        }
-        for name, (header, rows) in tables.items():
-            write_csv(folder / name, ("", *header), [(n, *row) for n, row in enumerate(rows)])
+        msls_city(
+            tmp_path / "train_val" / city / side,
+            [
+                {"key": f"{n:03d}", "m": 10 * n, "sequence": city + side, "frame": n}
+                for n in numbers
+            ],
+        )
     figures = follow(tmp_path, views, 1.3, "bicycle")
     assert figures["recall"]["single"] < 0.8
     assert figures["recall"]["filter"] > figures["recall"]["single"] + 0.1

@@ -25,7 +25,6 @@ from lab.training.data import (
     to_tensor,
 )
 from lab.training.photo_decoding import decode_resized
-from tests.lab.unit.data_sets import refused
 
 
 def places_of(**counts: int) -> list[TrainingPlace]:
@@ -112,10 +111,9 @@ def batches_of(
     places: list[TrainingPlace],
     *,
     num_workers: int = 0,
-    bad_is_error: bool = False,
 ) -> Iterator[Batch]:
     plan = PlaceBatchSampler(places, 2, 2, False, True, 1, 7)
-    photos = PlaceDataset(plan, PhotoTransform((32, 48)), fail_on_undecodable=bad_is_error)
+    photos = PlaceDataset(plan, PhotoTransform((32, 48)), fail_on_undecodable=True)
     return load_batches(plan, photos, 0, 0, num_workers=num_workers, pin_memory=False)
 
 
@@ -153,19 +151,6 @@ def test_reading_ahead_leaves_the_steps_own_random_numbers_alone(
     before = torch.get_rng_state()
     list(batches_of(photos_on_disk))
     assert torch.equal(torch.get_rng_state(), before)
-
-
-def test_a_photo_that_does_not_decode_is_left_out_and_named_or_an_error(
-    photos_on_disk: list[TrainingPlace],
-) -> None:
-    broken = photos_on_disk[2].photos[1]
-    broken.write_bytes(broken.read_bytes()[:200])
-    batches = list(batches_of(photos_on_disk))
-    assert [path for batch in batches for path, _ in batch.undecodable] == [str(broken)]
-    assert sum(len(batch.photos) for batch in batches) == 7
-    assert sorted(torch.cat([batch.labels for batch in batches]).tolist()).count(2) == 1
-    with refused("undecodable_photo", broken.name):
-        list(batches_of(photos_on_disk, bad_is_error=True))
 
 
 def test_augmentation_is_decided_by_its_seed() -> None:

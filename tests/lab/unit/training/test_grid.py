@@ -104,6 +104,17 @@ def test_every_example_is_read(file: Path) -> None:
         assert load_grid_plan(file, {}).runs
 
 
+def test_the_grid_of_aggregators_trains_each_as_the_tutorial_trains_boq() -> None:
+    tutorial = build_arguments(load_yaml(CONFIGS / "train-boq.yaml"))
+    plan = load_grid_plan(CONFIGS / "grid-aggregators.yaml", {})
+    runs = [build_arguments(planned.arguments) for planned in plan.runs]
+    assert tutorial in runs
+    network = {"agg_arch", "agg_config"}
+    assert {run.model_dump_json(exclude=network) for run in runs} == {
+        tutorial.model_dump_json(exclude=network)
+    }
+
+
 def plain_plan(*names: str) -> GridPlan:
     return GridPlan(tuple(PlannedRun(name, {"loss_name": "NTXentLoss"}) for name in names), {})
 
