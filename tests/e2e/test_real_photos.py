@@ -22,6 +22,8 @@ TRUE_MATCH = {
 # By day and from the same side. The others were taken at night, through a colour filter, or with
 # most of the building hidden: EfficientNet-Lite0 ranks them lower.
 EASY = ("q1.jpg", "q3.jpg")
+# In q4, the building of another photo covers more of the view.
+PROVEN = ("q1.jpg", "q2.jpg", "q3.jpg", "q5.jpg")
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +51,16 @@ def test_real_places_are_found_before_and_after_the_map_has_its_own_vocabulary(
     # 17 photos: by chance the five ranks would sum to 45.
     assert sum(foreign.values()) <= 25
     assert sum(own.values()) <= 25
+
+
+def test_matching_points_prove_real_places(server: ServerProcess, real_photos: Path) -> None:
+    for name in PROVEN:
+        query = (real_photos / "toy-places" / "queries" / name).read_bytes()
+        answer = server.ask(query, top_k=2, rerank=17, explain="true").json()
+        best, second = answer["similar_images"]
+        assert best["original_filename"] == TRUE_MATCH[name]
+        assert best["inliers"] > 1.5 * second["inliers"]
+        assert len(best["pairs"]) == best["inliers"]
 
 
 def ranks(server: ServerProcess, real_photos: Path, vocabulary: str) -> dict[str, int]:
