@@ -35,6 +35,11 @@ COMMAND = [
     "shared.storage.s3",
 ]
 LAB_COMMAND = "import sys; sys.argv = ['placewise', 'train', '--help']; main()"
+LOAD_XFEAT = """
+import torch
+from shared.matching.detectors import load_detector
+print(load_detector("xfeat", torch.device("cpu")).model)
+"""
 IMPORT = """
 import importlib, sys
 for module in sys.argv[1:]:
@@ -64,6 +69,24 @@ def test_an_image_holds_what_its_service_and_the_command_import(
 def test_only_the_images_that_describe_photos_hold_torch(image: BuildImage) -> None:
     holding = {service for service in MODULES if "torch" in image(service).packages()}
     assert holding == {"embedded", "extractor"}
+
+
+@pytest.mark.parametrize("service", ["embedded", "extractor"])
+def test_images_that_describe_photos_load_xfeat_and_nothing_that_its_package_requires(
+    service: str, image: BuildImage, tmp_path: Path
+) -> None:
+    required = {"gdown", "matplotlib", "opencv-python", "opencv-python-headless"}
+    assert not image(service).packages() & required
+    done = subprocess.run(
+        [image(service).python, "-c", LOAD_XFEAT],
+        cwd=tmp_path,
+        env=image(service).environment(tmp_path),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-1500:]
+    assert done.stdout.startswith("xfeat@")
 
 
 def test_no_image_holds_a_tool_of_the_developers(image: BuildImage) -> None:
