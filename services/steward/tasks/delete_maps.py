@@ -17,13 +17,17 @@ from sqlalchemy.orm import Session
 
 from services.steward.periodic_tasks import periodic_task
 from services.steward.tasks.garbage_collection import (
+    ROWS_PER_TRANSACTION,
+    delete_chunks,
+    delete_presigned_uploads,
+    delete_queries,
     delete_with_objects,
     deletion_is_journaled,
     journal_deletions,
 )
 from services.steward.tasks.maintenance import TRACKS_PER_TRANSACTION
 from shared.catalog.batch_items import BatchItem
-from shared.catalog.chunks import Chunk, Descriptor, delete_chunk_rows
+from shared.catalog.chunks import Descriptor
 from shared.catalog.database.base import affected_rows, is_journaled
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Evaluation, Generation
@@ -34,17 +38,11 @@ from shared.catalog.tracks import Track, delete_tracks
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.jobs.transitions import cancel_jobs
 from shared.storage import ObjectStore
-from shared.storage.chunks import delete_chunk
-from shared.storage.keys import (
-    ORIGINALS,
-    derived_image_keys,
-    incoming_key,
-    query_object_keys,
-)
+from shared.storage.keys import ORIGINALS, derived_image_keys
 
 log = logging.getLogger(__name__)
 
-ROWS_PER_TRANSACTION = 500  # rows deleted in one transaction
+CHUNKS_PER_STEP = 50  # of up to SLOT_ROWS descriptors each
 SLICE_SECONDS = 2.0  # of one run, so that the steward's other tasks are not delayed
 
 
@@ -98,30 +96,11 @@ def _cancel_jobs(catalog: Catalog, _store: ObjectStore, map_id: UUID) -> bool:
 
 
 def _purge_chunks(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
-    with catalog.read() as session:
-        chunks = session.scalars(
-            select(Chunk)
-            .join(Generation, Generation.id == Chunk.generation_id)
-            .where(Generation.map_id == map_id)
-            .limit(ROWS_PER_TRANSACTION // 10)
-        ).all()
-    for chunk in chunks:
-        delete_chunk(store, chunk.object_key)
-        with catalog.write() as session:
-            delete_chunk_rows(session, chunk.id)
-    return bool(chunks)
+    return delete_chunks(catalog, store, Generation.map_id == map_id, limit=CHUNKS_PER_STEP)
 
 
 def _purge_queries(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
-    return delete_with_objects(
-        catalog,
-        store,
-        select(Job.id)
-        .where(Job.map_id == map_id, Job.kind == JobKind.DESCRIBE)
-        .limit(ROWS_PER_TRANSACTION),
-        query_object_keys,
-        lambda session, ids: session.execute(delete(Job).where(Job.id.in_(ids))),
-    )
+    return delete_queries(catalog, store, Job.map_id == map_id)
 
 
 def _purge_batches(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
@@ -164,17 +143,7 @@ def _purge_photos(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
 
 
 def _purge_presigned_uploads(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
-    return delete_with_objects(
-        catalog,
-        store,
-        select(PresignedUpload.id)
-        .where(PresignedUpload.map_id == map_id)
-        .limit(ROWS_PER_TRANSACTION),
-        lambda upload_id: [incoming_key(upload_id)],
-        lambda session, ids: session.execute(
-            delete(PresignedUpload).where(PresignedUpload.id.in_(ids))
-        ),
-    )
+    return delete_presigned_uploads(catalog, store, PresignedUpload.map_id == map_id)
 
 
 def _purge_searches(catalog: Catalog, _store: ObjectStore, map_id: UUID) -> bool:

@@ -95,19 +95,33 @@ def deletion_is_journaled(table: type[Photo] | type[Map]) -> Condition:
     return or_(is_journaled(table), table.deleted_at < db_now_plus(-MAX_JOURNAL_WAIT_SECONDS))
 
 
-def collect_superseded_chunks(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
-    """Delete chunks that were merged into others, after a grace period for running queries."""
+def delete_chunks(
+    catalog: Catalog,
+    store: ObjectStore,
+    *conditions: Condition,
+    limit: int = ROWS_PER_TRANSACTION,
+) -> bool:
+    """Delete chunks with their objects and descriptors; return whether there were any.
+
+    The conditions may refer to the chunk's generation.
+    """
     with catalog.read() as session:
         chunks = session.scalars(
             select(Chunk)
-            .where(Chunk.superseded_at < db_now_plus(-grace_seconds))
-            .limit(ROWS_PER_TRANSACTION)
+            .join(Generation, Generation.id == Chunk.generation_id)
+            .where(*conditions)
+            .limit(limit)
         ).all()
     for chunk in chunks:
         delete_chunk(store, chunk.object_key)
-    if chunks:
         with catalog.write() as session:
-            session.execute(delete(Chunk).where(Chunk.id.in_([chunk.id for chunk in chunks])))
+            delete_chunk_rows(session, chunk.id)
+    return bool(chunks)
+
+
+def collect_superseded_chunks(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
+    """Delete chunks that were merged into others, after a grace period for running queries."""
+    delete_chunks(catalog, store, Chunk.superseded_at < db_now_plus(-grace_seconds))
 
 
 def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
@@ -116,33 +130,24 @@ def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_second
     Deletes their descriptors and chunks, and the reindex jobs of abandoned ones. The generation's
     own row stays as history until its map is deleted.
     """
+    ended_long_ago = Generation.ended_at < db_now_plus(-grace_seconds)
+    of_abandoned = (
+        select(Job.id)
+        .join(Generation, Generation.id == Job.generation_id)
+        .where(
+            Job.kind == JobKind.REINDEX,
+            Generation.state == GenerationState.ABANDONED,
+            ended_long_ago,
+        )
+        .limit(ROWS_PER_TRANSACTION)
+    )
     with catalog.read() as session:
-        ended = session.scalars(
-            select(Chunk)
-            .join(Generation, Generation.id == Chunk.generation_id)
-            .where(
-                Generation.state.in_((GenerationState.RETIRED, GenerationState.ABANDONED)),
-                Generation.ended_at < db_now_plus(-grace_seconds),
-            )
-            .limit(ROWS_PER_TRANSACTION)
-        ).all()
-        abandoned_job_ids = session.scalars(
-            select(Job.id)
-            .join(Generation, Generation.id == Job.generation_id)
-            .where(
-                Job.kind == JobKind.REINDEX,
-                Generation.state == GenerationState.ABANDONED,
-                Generation.ended_at < db_now_plus(-grace_seconds),
-            )
-            .limit(ROWS_PER_TRANSACTION)
-        ).all()
-    if abandoned_job_ids:
+        job_ids = session.scalars(of_abandoned).all()
+    if job_ids:
         with catalog.write() as session:
-            session.execute(delete(Job).where(Job.id.in_(abandoned_job_ids)))
-    for chunk in ended:
-        delete_chunk(store, chunk.object_key)
-        with catalog.write() as session:
-            delete_chunk_rows(session, chunk.id)
+            session.execute(delete(Job).where(Job.id.in_(job_ids)))
+    is_over = Generation.state.in_((GenerationState.RETIRED, GenerationState.ABANDONED))
+    delete_chunks(catalog, store, is_over, ended_long_ago)
 
 
 def collect_whitenings(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
@@ -222,26 +227,43 @@ def _delete_photo_rows(session: Session, grace_seconds: float) -> None:
     session.execute(delete(Photo).where(Photo.id.in_(photo_ids)))
 
 
-def collect_queries(catalog: Catalog, store: ObjectStore, ttl_seconds: float) -> None:
-    """Delete query jobs with their photos and descriptors after QUERY_TTL.
-
-    Jobs of pending frames stay until their frame is applied, or the track is deleted.
-    """
-    awaited_by_frame = exists().where(TrackFrame.job_id == Job.id, is_pending())
-    is_old = Job.created_at < db_now_plus(-ttl_seconds)
-    delete_with_objects(
+def delete_queries(catalog: Catalog, store: ObjectStore, *conditions: Condition) -> bool:
+    """Delete query jobs with their photos and descriptors; return whether there were any."""
+    return delete_with_objects(
         catalog,
         store,
-        select(Job.id)
-        .where(Job.kind == JobKind.DESCRIBE, is_old, ~awaited_by_frame)
-        .limit(ROWS_PER_TRANSACTION),
+        select(Job.id).where(Job.kind == JobKind.DESCRIBE, *conditions).limit(ROWS_PER_TRANSACTION),
         query_object_keys,
         lambda session, ids: session.execute(delete(Job).where(Job.id.in_(ids))),
     )
 
 
+def collect_queries(catalog: Catalog, store: ObjectStore, ttl_seconds: float) -> None:
+    """Delete queries after QUERY_TTL.
+
+    Jobs of pending frames stay until their frame is applied, or the track is deleted.
+    """
+    awaited_by_frame = exists().where(TrackFrame.job_id == Job.id, is_pending())
+    is_old = Job.created_at < db_now_plus(-ttl_seconds)
+    delete_queries(catalog, store, is_old, ~awaited_by_frame)
+
+
+def delete_presigned_uploads(catalog: Catalog, store: ObjectStore, condition: Condition) -> bool:
+    """Delete presigned uploads with the objects uploaded for them; return if there were any."""
+    return delete_with_objects(
+        catalog,
+        store,
+        select(PresignedUpload.id).where(condition).limit(ROWS_PER_TRANSACTION),
+        lambda upload_id: [incoming_key(upload_id)],
+        lambda session, ids: session.execute(
+            # Checked again: the upload may have been completed since it was selected.
+            delete(PresignedUpload).where(PresignedUpload.id.in_(ids), condition)
+        ),
+    )
+
+
 def collect_presigned_uploads(catalog: Catalog, store: ObjectStore) -> None:
-    """Delete presigned uploads that expired, with the objects uploaded for them.
+    """Delete presigned uploads that expired.
 
     Completed ones stay COMPLETED_UPLOAD_SECONDS longer: until then, completing one again returns
     the same response.
@@ -250,16 +272,7 @@ def collect_presigned_uploads(catalog: Catalog, store: ObjectStore) -> None:
         and_(PresignedUpload.response_body.is_(None), PresignedUpload.expires_at < db_now()),
         PresignedUpload.expires_at < db_now_plus(-COMPLETED_UPLOAD_SECONDS),
     )
-    delete_with_objects(
-        catalog,
-        store,
-        select(PresignedUpload.id).where(expired).limit(ROWS_PER_TRANSACTION),
-        lambda upload_id: [incoming_key(upload_id)],
-        lambda session, ids: session.execute(
-            # Checked again: the upload may have been completed since it was selected.
-            delete(PresignedUpload).where(PresignedUpload.id.in_(ids), expired)
-        ),
-    )
+    delete_presigned_uploads(catalog, store, expired)
 
 
 def collect_checkpoints(catalog: Catalog, store: ObjectStore) -> None:

@@ -290,7 +290,8 @@ def _check_remembered(catalog: Catalog, store: FolderStore) -> None:
 def test_a_map_of_more_rows_than_one_transaction_takes_goes_as_well(
     service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(delete_maps, "ROWS_PER_TRANSACTION", 10)  # and one chunk at once
+    monkeypatch.setattr(delete_maps, "ROWS_PER_TRANSACTION", 10)
+    monkeypatch.setattr(delete_maps, "CHUNKS_PER_STEP", 1)
     service.json("POST", "/maps", 201, json={"name": "gone"})
     before = rows(catalog)
     for number in range(3):
