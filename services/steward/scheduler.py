@@ -193,6 +193,6 @@ def _collect_orphans(
         return
     metrics.collection_held.set(0)
     metrics.objects_trashed.inc(moved)
-    deleted, remaining = empty_expired_trash(catalog, store, settings.trash_days)
+    deleted, remaining_bytes = empty_expired_trash(catalog, store, settings.trash_days)
     metrics.objects_deleted.labels("collect_orphans").inc(deleted)
-    metrics.trash_bytes.set(remaining.size_bytes)
+    metrics.trash_bytes.set(remaining_bytes)

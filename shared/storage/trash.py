@@ -13,18 +13,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from datetime import date, datetime
+from datetime import date
 from enum import StrEnum
 
 from shared.errors import NotFound
 from shared.storage.keys import OWNER_MARK, TRASH, key_before_trash, trash_key
-from shared.storage.protocol import ObjectInfo, ObjectStore, OwnedStore
-
-
-@dataclass(slots=True)
-class TrashSize:
-    objects: int = 0
-    size_bytes: int = 0
+from shared.storage.protocol import ObjectInfo, OwnedStore
 
 
 def move_to_trash(store: OwnedStore, key: str, day: date) -> bool:
@@ -34,28 +28,6 @@ def move_to_trash(store: OwnedStore, key: str, day: date) -> bool:
     except NotFound:
         return False
     return True
-
-
-def measure_trash(store: ObjectStore) -> TrashSize:
-    """Count the objects in the trash by listing them."""
-    size = TrashSize()
-    for info in store.list(TRASH):
-        size.objects += 1
-        size.size_bytes += info.size_bytes
-    return size
-
-
-def expire_trash(store: ObjectStore, before: datetime) -> tuple[int, TrashSize]:
-    """Delete objects moved to the trash before this time; return their number and the rest."""
-    deleted, remaining = 0, TrashSize()
-    for info in store.list(TRASH):
-        if info.modified_at < before:
-            store.delete(info.key)
-            deleted += 1
-        else:
-            remaining.objects += 1
-            remaining.size_bytes += info.size_bytes
-    return deleted, remaining
 
 
 def restore_trash(store: OwnedStore, prefix: str = "") -> Iterator[tuple[ObjectInfo, bool]]:

@@ -39,16 +39,10 @@ from shared.errors import Conflict, Misconfigured
 from shared.integrity.verify import IntegrityReport, repair_descriptors, verify_store
 from shared.jobs import InProcessWakeups
 from shared.storage import OwnedStore
+from shared.storage.keys import TRASH
 from shared.storage.open_store import open_store
 from shared.storage.ownership import read_owner
-from shared.storage.trash import (
-    Hold,
-    HoldReason,
-    measure_trash,
-    read_hold,
-    restore_trash,
-    write_hold,
-)
+from shared.storage.trash import Hold, HoldReason, read_hold, restore_trash, write_hold
 from shared.telemetry.logs import configure_logging
 
 if TYPE_CHECKING:
@@ -142,8 +136,8 @@ def verify_storage(
             report.orphans += 1
             report.orphan_bytes += info.size_bytes
             progress("orphaned objects", report.orphans, report.orphans)
-        trash = measure_trash(store)
-        report.trash_objects, report.trash_bytes = trash.objects, trash.size_bytes
+        trash = [info.size_bytes for info in store.list(TRASH)]
+        report.trash_objects, report.trash_bytes = len(trash), sum(trash)
         # No wakeup message is needed: workers poll, and the steward sends messages.
         queued = repair_descriptors(catalog, InProcessWakeups(), report) if repair else None
     return report, queued

@@ -41,6 +41,7 @@ from shared.storage.keys import (
     PREVIEWS,
     QUERIES,
     THUMBNAILS,
+    TRASH,
     VOCABULARIES,
     WHITENINGS,
     derived_image_keys,
@@ -52,9 +53,7 @@ from shared.storage.protocol import ObjectInfo
 from shared.storage.trash import (
     Hold,
     HoldReason,
-    TrashSize,
     end_hold,
-    expire_trash,
     move_to_trash,
     read_hold,
     write_hold,
@@ -195,15 +194,21 @@ def _select_orphans(catalog: Catalog, prefix: str, batch: list[ObjectInfo]) -> l
     return [info for info in batch if info.key not in referenced]
 
 
-def empty_expired_trash(
-    catalog: Catalog, store: ObjectStore, trash_days: float
-) -> tuple[int, TrashSize]:
+def empty_expired_trash(catalog: Catalog, store: ObjectStore, trash_days: float) -> tuple[int, int]:
     """Delete objects that were moved to the trash more than `trash_days` ago.
 
     Returns:
-        The number of deleted objects, and the size of the remaining trash.
+        The number of deleted objects, and the bytes of the others.
     """
-    return expire_trash(store, _now(catalog) - timedelta(days=trash_days))
+    cutoff = _now(catalog) - timedelta(days=trash_days)
+    deleted = remaining_bytes = 0
+    for info in store.list(TRASH):
+        if info.modified_at < cutoff:
+            store.delete(info.key)
+            deleted += 1
+        else:
+            remaining_bytes += info.size_bytes
+    return deleted, remaining_bytes
 
 
 def _now(catalog: Catalog) -> datetime:

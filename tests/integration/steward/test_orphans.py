@@ -35,7 +35,7 @@ from shared.storage.keys import (
     query_vector_key,
     thumbnail_key,
 )
-from shared.storage.trash import Hold, HoldReason, TrashSize, read_hold, restore_trash, write_hold
+from shared.storage.trash import Hold, HoldReason, read_hold, restore_trash, write_hold
 from tests.integration.steward.chunk_map import DAY_SECONDS, ChunkMap
 from tests.support.catalog_rows import add_chunk, add_job, ask, upload
 
@@ -110,10 +110,10 @@ def test_orphans_lie_in_the_trash_until_their_days_are_over(chunk_map: ChunkMap)
     assert collect(chunk_map) == 2
     trashed = chunk_map.objects("trash/")
     assert {key_before_trash(key) for key in trashed} == orphans
-    assert empty_expired_trash(chunk_map.catalog, chunk_map.store, 7.0) == (0, TrashSize(2, 12))
+    assert empty_expired_trash(chunk_map.catalog, chunk_map.store, 7.0) == (0, 12)
     chunk_map.age(trashed, 7.1 * DAY_SECONDS)
     chunk_map.age({first := min(trashed)}, 6.9 * DAY_SECONDS)
-    assert empty_expired_trash(chunk_map.catalog, chunk_map.store, 7.0) == (1, TrashSize(1, 6))
+    assert empty_expired_trash(chunk_map.catalog, chunk_map.store, 7.0) == (1, 6)
     assert chunk_map.objects("trash/") == {first}
     assert chunk_map.objects() == live
 
