@@ -201,21 +201,15 @@ def update_batch_progress(job: Job, counts: Counter[JobState]) -> None:
 
 def summarise_batch(session: Session, job: Job, counts: Counter[JobState]) -> dict[str, Any]:
     """Return the result of an ended batch, as photo counts; `ignored` counts other objects."""
-    already_there = session.scalar(
-        sa.select(sa.func.count())
-        .select_from(BatchItem)
-        .where(
-            BatchItem.job_id == job.id,
-            BatchItem.state == JobState.SUCCEEDED,
-            BatchItem.already_there,
-        )
+    already_there = sa.select(BatchItem.number).where(
+        BatchItem.job_id == job.id, BatchItem.state == JobState.SUCCEEDED, BatchItem.already_there
     )
     return {
         "photos": counts.total(),
         "succeeded": counts[JobState.SUCCEEDED],
         "failed": counts[JobState.FAILED],
         "cancelled": counts[JobState.CANCELLED],
-        "already_there": already_there,
+        "already_there": count_rows(session, already_there),
         "ignored": job.params.get("ignored", 0),
     }
 

@@ -210,13 +210,8 @@ def list_live_filter_values(
     return [(row[0], PhotoFilterValues(*row[1:])) for row in rows]
 
 
-def _count_described(session: Session, generation_id: UUID, role: PhotoRole | None = None) -> int:
-    """Count the live photos, of one role or of all, with a descriptor in the generation."""
-    return count_rows(session, _select_described(generation_id, role))
-
-
 def estimate_described(session: Session, generation_id: UUID) -> int:
-    """Count as `_count_described`, or estimate, for progress.
+    """Count the live photos with a descriptor in the generation, or estimate, for progress.
 
     Above MAX_EXACT_COUNT it is the sum of the chunks' rows, which may include rows of photos that
     were deleted since the last compaction.
@@ -226,14 +221,14 @@ def estimate_described(session: Session, generation_id: UUID) -> int:
             Chunk.generation_id == generation_id, Chunk.superseded_at.is_(None)
         )
     )
-    return (
-        int(rows) if rows and rows > MAX_EXACT_COUNT else _count_described(session, generation_id)
-    )
+    if rows and rows > MAX_EXACT_COUNT:
+        return int(rows)
+    return count_rows(session, _select_described(generation_id))
 
 
 def count_searchable(session: Session, generation_id: UUID) -> int:
     """Count the photos that searches of the generation can return."""
-    return _count_described(session, generation_id, PhotoRole.DATABASE)
+    return count_rows(session, _select_described(generation_id, PhotoRole.DATABASE))
 
 
 def select_failed_photos(map_id: UUID) -> sa.Select[UUID]:
@@ -267,7 +262,7 @@ def has_geotagged(session: Session, generation_id: UUID, role: PhotoRole) -> boo
     return session.scalar(geotagged.limit(1)) is not None
 
 
-def _select_described(generation_id: UUID, role: PhotoRole | None) -> sa.Select[UUID]:
+def _select_described(generation_id: UUID, role: PhotoRole | None = None) -> sa.Select[UUID]:
     statement = (
         sa.select(Descriptor.photo_id)
         .join(Photo, Photo.id == Descriptor.photo_id)

@@ -11,7 +11,6 @@ the response has the time of the count.
 from __future__ import annotations
 
 import time
-from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from enum import StrEnum
@@ -47,7 +46,13 @@ from shared.catalog.generations import (
     active_generation,
 )
 from shared.catalog.jobs import Job, WaitingFor
-from shared.catalog.photos import Photo, PhotoRole, count_live_photos, is_geotagged
+from shared.catalog.photos import (
+    Photo,
+    PhotoRole,
+    count_live_photos,
+    is_geotagged,
+    select_live_photos,
+)
 from shared.errors import Conflict, NotFound
 from shared.ids import new_id
 from shared.place_paths import look_like_paths
@@ -385,9 +390,7 @@ def has_database_photos(session: Session, map_id: UUID, number: int) -> bool:
     if number > MAX_EXACT_COUNT:
         cached = session.get(CachedMapStatistics, map_id)
         return cached is not None and MapStatistics(**cached.figures).photos >= number
-    photos = sa.select(Photo.id).where(
-        Photo.map_id == map_id, Photo.deleted_at.is_(None), Photo.role == PhotoRole.DATABASE
-    )
+    photos = select_live_photos(map_id, PhotoRole.DATABASE)
     return count_rows(session, photos, number) == number
 
 
@@ -410,13 +413,3 @@ def cache_map_statistics(session: Session, map_id: UUID) -> None:
     session.merge(
         CachedMapStatistics(map_id=map_id, figures=figures, counted_at=now, took_seconds=took)
     )
-
-
-def list_maps_with_cached_statistics(session: Session) -> set[UUID]:
-    """Return the ids of the maps whose statistics are cached."""
-    return set(session.scalars(sa.select(CachedMapStatistics.map_id)))
-
-
-def delete_cached_statistics(session: Session, map_ids: Collection[UUID]) -> None:
-    """Delete the cached statistics of these maps."""
-    session.execute(sa.delete(CachedMapStatistics).where(CachedMapStatistics.map_id.in_(map_ids)))

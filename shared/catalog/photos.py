@@ -203,18 +203,20 @@ def list_photos_changed_since(
     return [PhotoFilterValues(*row) for row in rows]
 
 
+def select_live_photos(map_id: UUID, role: PhotoRole | None = None) -> sa.Select[UUID]:
+    """Select the live photos of the map, of one role or of all."""
+    statement = sa.select(Photo.id).where(Photo.map_id == map_id, Photo.deleted_at.is_(None))
+    return statement if role is None else statement.where(Photo.role == role)
+
+
 def count_live_photos(session: Session, map_id: UUID, role: PhotoRole | None = None) -> int:
     """Count the live photos of the map, of one role or of all."""
-    statement = sa.select(Photo.id).where(Photo.map_id == map_id, Photo.deleted_at.is_(None))
-    return count_rows(session, statement if role is None else statement.where(Photo.role == role))
+    return count_rows(session, select_live_photos(map_id, role))
 
 
 def has_live_photo(session: Session, map_id: UUID, role: PhotoRole) -> bool:
     """Return whether the map has a live photo of the role."""
-    statement = sa.select(Photo.id).where(
-        Photo.map_id == map_id, Photo.deleted_at.is_(None), Photo.role == role
-    )
-    return session.scalar(statement.limit(1)) is not None
+    return session.scalar(select_live_photos(map_id, role).limit(1)) is not None
 
 
 def is_geotagged(photo: type[Photo] = Photo) -> Condition:

@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from shared.catalog.database.base import db_now_plus
+from shared.catalog.database.base import count_rows, db_now_plus
 from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, Priority
 from shared.catalog.maps import Map
 
@@ -84,16 +84,11 @@ def measure_queue_depth(session: Session, limit: int) -> QueueDepth:
     """Count up to `limit` jobs and up to `limit` queries, with the index that claims use."""
     jobs_by_map = _count_by_map(session, BACKLOG_PRIORITIES, limit)
     queries = sum(_count_by_map(session, (Priority.QUERY,), limit).values())
-    finished = (
-        select(Job.id)
-        .where(
-            Job.kind.in_((JobKind.INDEX, JobKind.DESCRIBE)),
-            Job.finished_at > db_now_plus(-THROUGHPUT_WINDOW_SECONDS),
-        )
-        .limit(MAX_COUNTED_FINISHED)
-        .subquery()
+    finished = select(Job.id).where(
+        Job.kind.in_((JobKind.INDEX, JobKind.DESCRIBE)),
+        Job.finished_at > db_now_plus(-THROUGHPUT_WINDOW_SECONDS),
     )
-    finished_count = session.scalar(select(func.count()).select_from(finished)) or 0
+    finished_count = count_rows(session, finished, MAX_COUNTED_FINISHED)
     return QueueDepth(jobs_by_map, queries, finished_count / THROUGHPUT_WINDOW_SECONDS)
 
 

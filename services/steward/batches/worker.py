@@ -327,9 +327,8 @@ class BatchWorker:
 
     def _next_items(self, job: Job) -> list[BatchItem]:
         """Return the next queued items, up to the free capacity of the extractors' queue."""
-        max_queued = self._ahead_photos
         with self._catalog.read() as session:
-            room = max_queued - count_queued_photos(session, max_queued)
+            room = self._ahead_photos - count_queued_photos(session, self._ahead_photos)
             return next_queued_items(session, job.id, min(READ_ITEMS, room)) if room > 0 else []
 
     def _finish_slice(self, job: Job, waiting_for: WaitingFor | None = None) -> None:
@@ -357,8 +356,7 @@ class BatchWorker:
             update_batch_progress(leased, counts)
 
     def _pause_seconds(self, session: Session, job: Job) -> float:
-        max_queued = self._ahead_photos
-        if count_queued_photos(session, max_queued) == max_queued:
+        if count_queued_photos(session, self._ahead_photos) == self._ahead_photos:
             return PROGRESS_POLL_SECONDS
         other = select(Job.id).where(claimable_condition((JobKind.BATCH,)), Job.id != job.id)
         return YIELD_SECONDS if session.scalar(select(exists(other))) else 0.0

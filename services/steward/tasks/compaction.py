@@ -18,7 +18,7 @@ from sqlalchemy.orm import Session
 
 from services.steward.periodic_tasks import periodic_task
 from shared.catalog.chunks import Chunk, Descriptor, list_live_rows
-from shared.catalog.database.base import db_now
+from shared.catalog.database.base import count_rows, db_now
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, lock_generation
 from shared.catalog.maps import Map, increment_map_version, lock_map
@@ -230,9 +230,8 @@ def _find_slots_to_merge(catalog: Catalog, compact_chunks: int) -> list[tuple[UU
 
 def _count_live_rows(session: Session, generation_id: UUID, slot: int) -> int:
     """Count the rows of the slot that belong to live photos."""
-    counted = (
-        select(func.count())
-        .select_from(Chunk)
+    live = (
+        select(Chunk.id)
         .join(Descriptor, Descriptor.chunk_id == Chunk.id)
         .join(Photo, Photo.id == Descriptor.photo_id)
         .where(
@@ -242,4 +241,4 @@ def _count_live_rows(session: Session, generation_id: UUID, slot: int) -> int:
             Photo.deleted_at.is_(None),
         )
     )
-    return session.scalar(counted) or 0
+    return count_rows(session, live)

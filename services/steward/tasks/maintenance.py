@@ -18,13 +18,12 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.idempotency import IdempotencyRecord
 from shared.catalog.jobs import Job, JobState, Priority, claimable_condition
 from shared.catalog.maps import (
+    CachedMapStatistics,
     Search,
     are_statistics_stale,
     cache_map_statistics,
-    delete_cached_statistics,
     is_large_map,
     list_maps,
-    list_maps_with_cached_statistics,
 )
 from shared.catalog.photos import Photo
 from shared.catalog.tracks import RETENTION_DAYS, Track, delete_tracks
@@ -142,10 +141,11 @@ def update_statistics_of_large_maps(catalog: Catalog) -> None:
         maps = [map_.id for map_ in list_maps(session)]
         large = {map_id for map_id in maps if is_large_map(session, map_id)}
         due = [map_id for map_id in large if are_statistics_stale(session, map_id)]
-        outdated = list_maps_with_cached_statistics(session) - large
+        cached = set(session.scalars(select(CachedMapStatistics.map_id)))
     for map_id in due:
         with catalog.write() as session:
             cache_map_statistics(session, map_id)
-    if outdated:
+    if outdated := cached - large:
         with catalog.write() as session:
-            delete_cached_statistics(session, outdated)
+            is_outdated = CachedMapStatistics.map_id.in_(outdated)
+            session.execute(delete(CachedMapStatistics).where(is_outdated))

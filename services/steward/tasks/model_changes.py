@@ -17,7 +17,7 @@ from __future__ import annotations
 import logging
 from uuid import UUID
 
-from sqlalchemy import exists, func, select
+from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
 
 from services.steward.periodic_tasks import periodic_task
@@ -191,9 +191,8 @@ def _is_complete(
 
 def _check_losses(session: Session, job: Job, generation: Generation) -> Unprocessable | None:
     """Count the job's failed photos; return the error if too many of them are searchable now."""
-    job.progress_failed = _count_jobs(
-        session, _open_jobs(job, generation) & (Job.state == JobState.FAILED)
-    )
+    failed = select(Job.id).where(_open_jobs(job, generation), Job.state == JobState.FAILED)
+    job.progress_failed = count_rows(session, failed)
     active = active_generation(session, generation.map_id)
     if not job.progress_failed or active is None or active.id == generation.id:
         return None
@@ -289,7 +288,3 @@ def _activate_generation(session: Session, job: Job, generation: Generation) -> 
         },
     )
     increment_map_version(session, generation.map_id)
-
-
-def _count_jobs(session: Session, condition: Condition) -> int:
-    return session.scalar(select(func.count()).select_from(Job).where(condition)) or 0
