@@ -216,10 +216,9 @@ function figures(photos, weighted) {
     ? `Photos are in the order of the probability that they show the same place. It is computed from all similarities${weighted ? ", with word weights" : ""}. A match is strong from 80 %, fair from 30 %, and weak below. Photos without coordinates or a label keep their place in the order of similarity.`
     : "Photos are in the order of their similarity.";
   const matched = photos.some((photo) => photo.inliers !== null);
-  const heads = ["", "Photo", ...(likely ? ["Same place"] : []), ...(weighted ? ["Weighted score"] : []), "Similarity", ...(matched ? ["Matching points"] : [])];
+  const heads = ["", "Photo", ...(likely ? ["Same place"] : []), ...(weighted ? ["Weighted score"] : []), ...(matched ? ["Matching points"] : []), "Similarity"];
   const numbers = (photo) => [
-    ...(likely ? [percent(photo.match_probability)] : []), ...(weighted ? [score(photo.weighted_score)] : []), score(photo.similarity_score),
-    ...(matched ? [photo.inliers === null ? "–" : count(photo.inliers)] : []),
+    ...(likely ? [percent(photo.match_probability)] : []), ...(weighted ? [score(photo.weighted_score)] : []), ...(matched ? [photo.inliers === null ? "–" : count(photo.inliers)] : []), score(photo.similarity_score),
   ];
   return h("details", { class: "card figures" }, h("summary", {}, "Details"),
     h("p", { class: "soft" }, `${order} Similarity is the cosine of two descriptors.`),
