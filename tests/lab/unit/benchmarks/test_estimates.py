@@ -43,6 +43,7 @@ def described() -> DescribedPhotos:
         np.arange(len(places)) // PER_PLACE,
         LevelScheme(labels_are_paths=True, radii_m=(25.0,)),
         25.0,
+        [Path(f"{number}.jpg") for number in range(len(places))],
     )
 
 
