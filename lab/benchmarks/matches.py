@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -196,6 +196,6 @@ def add_peer(report: Report, name: str, matched: MatchedPhotos) -> None:
         report.add(f"{name}: CPU a pair, kornia in a loop", elapsed_ms, "ms")
 
 
-def _percent(counted: Any) -> float:
-    values = list(counted)
+def _percent(counted: Iterable[bool | None]) -> float:
+    values = [bool(value) for value in counted]
     return 100.0 * sum(values) / max(1, len(values))

@@ -170,24 +170,17 @@ class MapEvaluationResult:
     """Whether matches help the map; None if too few photos could be matched."""
 
 
-@dataclass(frozen=True, slots=True)
-class _MatchEvaluation:
-    """A place model with matches, and whether it is better than the one without."""
-
-    places: PlaceEvaluation
-    is_used: bool
-
-
 def _helps(without: PlaceEvaluation, with_matches: PlaceEvaluation) -> bool:
-    """Return whether matches raise the answered share by MIN_ANSWERED_GAIN, and lower none.
+    """Return whether matches raise the answered share, at any level and at the finest.
 
-    The share of right answers is the same: the thresholds of both models are chosen for it.
+    One of them rises by MIN_ANSWERED_GAIN, and the other does not fall by as much. The share of
+    right answers is the same: the thresholds of both models are chosen for it.
     """
     gains = [
         _answered(with_matches, share) - _answered(without, share)
         for share in ("answered", "answered_at_finest_level")
     ]
-    return max(gains) >= MIN_ANSWERED_GAIN and min(gains) >= 0
+    return min(max(gains), sum(gains)) >= MIN_ANSWERED_GAIN
 
 
 def _answered(places: PlaceEvaluation, share: str) -> float:
@@ -261,20 +254,19 @@ class MapEvaluation:
         places = evaluate_places(
             samples, [o.sample for o in to_fit if o.sample], self.scheme, spread
         )
-        model, with_matches = places.model, None
-        if self.matching != Matching.OFF:
-            with_matches = self._evaluate_matches(own_photos, samples, to_fit, spread)
-        if with_matches is not None and with_matches.is_used:
-            model = model.model_copy(update={"with_matches": with_matches.places.model})
+        model = places.model
+        with_matches, uses_matches = self._evaluate_matches(own_photos, samples, to_fit, spread)
+        if with_matches is not None and uses_matches:
+            model = model.model_copy(update={"with_matches": with_matches.model})
         figures = {
             "radius_m": self.radius_m,
             **recalls,
             "labelled_queries": labelled.figures(places.model) if self.queries else None,
             "places": places.figures,
-            "places_with_matches": with_matches and with_matches.places.figures,
-            "uses_matches": with_matches and with_matches.is_used,
+            "places_with_matches": with_matches and with_matches.figures,
+            "uses_matches": uses_matches,
         }
-        return MapEvaluationResult(figures, model, with_matches and with_matches.is_used)
+        return MapEvaluationResult(figures, model, uses_matches)
 
     def matched_photos(self, sample: Sequence[GeotaggedPhoto]) -> int:
         """Return how many photos of a sample are matched with others."""
@@ -286,12 +278,15 @@ class MapEvaluation:
         samples: Sequence[PlaceSample],
         labelled: Sequence[QueryOutcome],
         spread: float,
-    ) -> _MatchEvaluation | None:
+    ) -> tuple[PlaceEvaluation | None, bool | None]:
         """Fit a place model with matches, and one without on the same photos to compare it with.
 
         Returns:
-            None if too few photos can be matched with those that they find.
+            The model, and whether it is used; None if too few photos can be matched with those
+            that they find.
         """
+        if self.matching == Matching.OFF:
+            return None, None
         chosen = sorted({sample.photo for sample in samples})
         if len(chosen) > MAX_MATCHED_SAMPLE:
             rng = np.random.default_rng(len(chosen))
@@ -302,15 +297,14 @@ class MapEvaluation:
             self.on_query()
         photos = {sample.photo for sample in matched}
         if len(photos) < MIN_OWN_PHOTOS:
-            return None
+            return None, None
         plain = [sample for sample in samples if sample.photo in photos]
         both = [(o.sample, o.matched_sample) for o in labelled if o.sample and o.matched_sample]
         without = evaluate_places(plain, [each for each, _ in both], self.scheme, spread)
         places = evaluate_places(matched, [each for _, each in both], self.scheme, spread)
-        is_used = self.matching == Matching.ON or _helps(without, places)
-        if not is_used and len(photos) < MIN_PHOTOS_TO_DECIDE:
-            return None
-        return _MatchEvaluation(places, is_used)
+        if self.matching == Matching.ON or _helps(without, places):
+            return places, True
+        return places, False if len(photos) >= MIN_PHOTOS_TO_DECIDE else None
 
     def _match_own_photo(self, photo: int, others: Sequence[Any]) -> Sequence[float | None]:
         photos = self.database.photos

@@ -259,13 +259,14 @@ def repair_descriptors(catalog: Catalog, wakeups: Wakeups, report: IntegrityRepo
     more: searches do not match its photos.
     """
     queued = 0
-    faults = [fault for fault in report.faults if fault.chunk_id is not None]
-    without_features = [f.chunk_id for f in faults if f.what == ObjectKind.FEATURES]
+    faults = [(f.chunk_id, f.what) for f in report.faults if f.chunk_id is not None]
+    without_features = [chunk_id for chunk_id, what in faults if what == ObjectKind.FEATURES]
     if without_features:
         none = {"features_model": None, "features_rows": 0, "features_bytes": 0}
         with catalog.write() as session:
             session.execute(update(Chunk).where(Chunk.id.in_(without_features)).values(**none))
-    for chunk_id in dict.fromkeys(f.chunk_id for f in faults if f.what != ObjectKind.FEATURES):
+    damaged = (chunk_id for chunk_id, what in faults if what != ObjectKind.FEATURES)
+    for chunk_id in dict.fromkeys(damaged):
         queued += catalog.run(partial(discard_chunk, chunk_id=chunk_id))
     photo_ids = [fault.photo_id for fault in report.faults if fault.photo_id is not None]
     if photo_ids:

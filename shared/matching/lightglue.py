@@ -54,7 +54,8 @@ class LightGlueMatcher:
             raise Misconfigured("unknown_detector", f"LightGlue has no weights for {detector!r}.")
         package, file, extra, configuration = CONFIGURATIONS[detector]
         state, _ = read_package_weights(package, file, extra)
-        network = LightGlue(None, **configuration)
+        # With a name instead of None, kornia would download weights.
+        network = LightGlue(None, **configuration)  # type: ignore[arg-type]
         load_tensors(network, _rename_tensors(state), frozenset({"confidence_thresholds"}))
         self._network = network.to(device)
         self._device = device

@@ -22,7 +22,7 @@ class XFeatDetector:
         network = XFeat(top_k=MAX_KEYPOINTS)
         load_tensors(network.net, state)
         # Convolutions of this layout take a fifth less time on a CPU.
-        self._network = network.eval().to(device, memory_format=torch.channels_last)
+        self._network = network.eval().to(device=device).to(memory_format=torch.channels_last)
         self._device = device
         self.model = model_name("xfeat", sha256)
 

@@ -32,7 +32,8 @@ SIDE = 512
 
 
 def photograph() -> Image.Image:
-    return Image.fromarray(data.astronaut())
+    pixels: NDArray[np.uint8] = data.astronaut()  # type: ignore[no-untyped-call]
+    return Image.fromarray(pixels)
 
 
 def turned() -> Image.Image:

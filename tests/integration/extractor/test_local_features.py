@@ -16,7 +16,7 @@ from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map, Matching
 from shared.descriptors.extractor import Extractor
-from shared.jobs import JobKind, JobState
+from shared.jobs import JobKind, JobState, reclaim_expired_leases
 from shared.jobs.model_changes import start_reindex
 from shared.matching.features import LocalFeatures
 from shared.matching.matchers import MutualNearest
@@ -238,7 +238,10 @@ def test_on_resumes_after_a_kill_with_what_is_missing(
             workplace.drain()
     orphans = {key for key in workplace.keys(f"chunks/{building.id}") if key.endswith(".features")}
     assert len(orphans) == 1
-    workplace.take_over(reindexed)
+    for reindexed_id in reindexed:
+        set_columns(workplace.catalog, reindexed_id, lease_until=None)
+    with workplace.catalog.write() as session:
+        reclaim_expired_leases(session, all_leases=True)
     assert workplace.finish(job_id).state == JobState.SUCCEEDED
     assert all(keypoints(workplace).values())
 
