@@ -110,10 +110,9 @@ def prepare_features(
 def _is_matched(job: Job, uses_matches: bool | None) -> bool:
     """Return whether the search of a query photo will match it."""
     params: dict[str, Any] = job.params.get("search_params", {})
-    if params.get("rerank") or params.get("explain"):
-        return True
+    by_default = uses_matches or params.get("explain")
     matches = params.get("matches")
-    return bool(uses_matches) if matches is None else matches > 0
+    return bool(params.get("rerank") or (by_default if matches is None else matches))
 
 
 def read_stored_features(

@@ -341,9 +341,8 @@ def _accept_frame(
             )
             stored = add_frame(session, track, frame, form.expected_version)
             if stored is frame:
-                session.add(
-                    describe_query_job(job_id, track.map_id, received.filename, SearchParams())
-                )
+                unmatched = SearchParams(matches=0)
+                session.add(describe_query_job(job_id, track.map_id, received.filename, unmatched))
             response = _frame_response(stored, map_name)
             headers = accepted_headers(response.frame_url)
             idempotent.store_response(session, 202, response, headers)

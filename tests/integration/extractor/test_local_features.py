@@ -164,6 +164,7 @@ def test_features_of_photos_are_computed_as_the_map_says_and_as_an_evaluation_de
         (Matching.AUTO, False, {"rerank": 5}, True),
         (Matching.AUTO, False, {"explain": True}, True),
         (Matching.AUTO, True, {"matches": 0}, False),
+        (Matching.AUTO, True, {"matches": 0, "explain": True}, False),
         (Matching.OFF, True, {"matches": 5}, False),
     ],
 )

@@ -15,7 +15,7 @@ from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
 from shared.errors import Unprocessable
-from shared.imaging.decode import THUMBNAIL_PIXELS, decode_photo
+from shared.imaging.decode import FULL_DECODE_PIXELS, THUMBNAIL_PIXELS, decode_photo
 from shared.imaging.file_formats import Previews, detect_media_type
 from shared.imaging.preprocessing import get_preprocessing
 from tests.support.photos import encoded, photo_bytes, photo_image, turned_photo
@@ -190,6 +190,16 @@ def test_too_many_pixels_are_an_error_that_names_the_limit() -> None:
     assert "64 x 48" in error.detail
     assert str(64 * 48 - 1) in error.detail
     decode_photo(photo_bytes(1, "PNG"), SQUARE, max_pixels=64 * 48)
+
+
+def test_working_copy_is_small_and_upright_and_the_size_is_that_of_the_upright_photo() -> None:
+    data = turned_photo(Image.new("RGB", (6000, 8400)), 6, "JPEG")
+    assert 6000 * 8400 > FULL_DECODE_PIXELS, "it is decoded at half its size"
+    decoded = decode_photo(data, SQUARE, 10**9, working=True)
+    assert decoded.size == (6000, 8400)
+    assert decoded.working is not None
+    assert decoded.working.shape == (640, 457, 3)
+    assert decode_photo(photo_bytes(1), SQUARE, PIXELS).working is None
 
 
 def private_exif() -> Image.Exif:
