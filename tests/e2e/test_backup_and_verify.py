@@ -100,4 +100,7 @@ def test_what_is_not_there_can_neither_be_backed_up_nor_verified(tmp_path: Path)
         refused = run(tmp_path / "home", "storage", *command, code=1)
         assert refused["code"] == "nothing_stored"
     assert not (tmp_path / "out").exists()
-    assert run(tmp_path / "home", "restore", tmp_path / "out", code=1)["code"] == "no_backup"
+    assert (
+        run(tmp_path / "home", "storage", "restore", tmp_path / "out", code=1)["code"]
+        == "no_backup"
+    )
