@@ -134,8 +134,8 @@ class ModelRegistry:
         return self.extractor(generation.extractor, precision)
 
     def _load(self, config: ExtractorConfig, precision: Precision) -> Extractor:
-        limit = self._pass_limits[config.local_features]
-        shared_backbone = self._backbones.get(config.local_features)
+        limit = self._pass_limits[config.backbone_key]
+        shared_backbone = self._backbones.get(config.backbone_key)
         if shared_backbone is not None:
             return Extractor(
                 config, self._device, precision=precision, backbone=shared_backbone, limit=limit
@@ -150,7 +150,7 @@ class ModelRegistry:
             backbone=self._load_added(added, self._device) if added else None,
             limit=limit,
         )
-        self._backbones[config.local_features] = extractor.backbone
+        self._backbones[config.backbone_key] = extractor.backbone
         if self._device.type == "cuda":
             extractor.warm_up(self._settings.batch_photos)
         self._on_load(time.perf_counter() - started)

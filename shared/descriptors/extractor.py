@@ -69,7 +69,7 @@ class Extractor:
         Args:
             dino_weights: The setting DINO_WEIGHTS, for DINOv2 backbones; None means timm's weights
                 from the Hugging Face hub.
-            backbone: A loaded backbone with the same `config.local_features`. Required for a
+            backbone: A loaded backbone with the same `config.backbone_key`. Required for a
                 registered model.
             limit: The batch size limit that was measured for `backbone`.
 
@@ -181,8 +181,8 @@ class Extractor:
         with autocast(self.precision, self.backbone.device):
             return self.backbone.features(torch.from_numpy(np.ascontiguousarray(pixels)))
 
-    def local_features(self, photos: Collection[Pixels]) -> list[torch.Tensor]:
-        """Return the local features of photos of any sizes, in their order.
+    def patch_features(self, photos: Collection[Pixels]) -> list[torch.Tensor]:
+        """Return the patch features of photos of any sizes, in their order.
 
         Returns:
             One (patches, width) float32 tensor for each photo, on the CPU.
@@ -236,7 +236,7 @@ class Extractor:
     def _run_in_batches(
         self, photos: Collection[Pixels], transform: Callable[[torch.Tensor], torch.Tensor]
     ) -> Iterator[tuple[list[int], torch.Tensor]]:
-        """Yield, per batch, indices into `photos` and `transform` of their local features."""
+        """Yield, per batch, indices into `photos` and `transform` of their patch features."""
         return run_in_batches(
             photos,
             lambda pixels: transform(self.features(pixels)),

@@ -105,7 +105,7 @@ def fit_vocabulary(
     """Fit a VLAD vocabulary to photos.
 
     Args:
-        extractor: Computes the local features.
+        extractor: Computes the patch features.
         batches: Photos (height, width, 3) as the extractor's preprocessing returns them, of any
             sizes, in random order (`sample_photos`).
         photos: Upper bound of the number of photos.
@@ -120,7 +120,7 @@ def fit_vocabulary(
     with PatchFile(extractor.backbone.width) as patches:
         described = 0
         for batch in batches:
-            patches.add(extractor.local_features(batch), described, photos, seed)
+            patches.add(extractor.patch_features(batch), described, photos, seed)
             described += len(batch)
             on_progress("describing", described, photos)
         fit = fit_centres(

@@ -62,7 +62,7 @@ def parse_centres(array: NDArray[np.float32], *, width: int | None = None) -> Cl
 
     Args:
         array: (clusters, dimension) of floating point numbers.
-        width: The length of the local features that the centres are used with; None skips the
+        width: The length of the patch features that the centres are used with; None skips the
             check.
 
     Raises:
@@ -80,7 +80,7 @@ def parse_centres(array: NDArray[np.float32], *, width: int | None = None) -> Cl
         array = np.ascontiguousarray(array, dtype=np.float32)
     if width is not None and array.shape[1] != width:
         raise unusable(
-            f"its centres have {array.shape[1]} dimensions, the extractor's local features {width}"
+            f"its centres have {array.shape[1]} dimensions, the extractor's patch features {width}"
         )
     if not np.isfinite(array).all():
         raise unusable("it holds NaN or infinite numbers")

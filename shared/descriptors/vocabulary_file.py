@@ -6,8 +6,8 @@
 - `.npy`: the centres alone.
 - `.pt`: the centres alone, as one tensor: AnyLoc's `c_centers.pt`.
 
-The provenance names the backbone, weights, layer, facet and preprocessing of the local features
-that a vocabulary was fitted on. Cosines between local features and centres are meaningful only if
+The provenance names the backbone, weights, layer, facet and preprocessing of the patch features
+that a vocabulary was fitted on. Cosines between patch features and centres are meaningful only if
 all of these agree; a shape check would accept a vocabulary of the same width but of other features,
 and every descriptor would be wrong.
 """
@@ -43,7 +43,7 @@ UNKNOWN_PROVENANCE: Provenance = {"learnt_with": "unknown"}
 
 
 def feature_provenance(extractor: Extractor) -> Provenance:
-    """Return the provenance of the extractor's local features."""
+    """Return the provenance of the extractor's patch features."""
     backbone = extractor.backbone
     return {
         "backbone": backbone.name,
@@ -82,7 +82,7 @@ def fit_provenance(
 def check_vocabulary_fits(
     provenance: Provenance, centres: ClusterCentres, extractor: Extractor
 ) -> None:
-    """Check that the vocabulary was fitted on the extractor's local features.
+    """Check that the vocabulary was fitted on the extractor's patch features.
 
     A vocabulary of unknown origin only needs the same width.
 
@@ -110,7 +110,7 @@ def check_vocabulary_fits(
 def check_vocabulary_width(
     centres: ClusterCentres, config: ExtractorConfig, width: int | None
 ) -> None:
-    """Check that the centres have the width of the extractor's local features.
+    """Check that the centres have the width of the extractor's patch features.
 
     `width` None skips the check: the width is known only after the network is loaded.
 
@@ -119,7 +119,7 @@ def check_vocabulary_width(
     if width is not None and centres.dimension != width:
         raise Unprocessable(
             "vocabulary_unusable",
-            f"The vocabulary has {centres.dimension} dimensions, the local features of "
+            f"The vocabulary has {centres.dimension} dimensions, the patch features of "
             f"{config.name} {width}.",
         )
 

@@ -114,7 +114,7 @@ class ExtractorConfig:
         return self.width * (self.clusters if self.needs_vocabulary else 1)
 
     @property
-    def local_features(self) -> tuple[int | str | TorchHubEntry | TrainedModelName | None, ...]:
+    def backbone_key(self) -> tuple[int | str | TorchHubEntry | TrainedModelName | None, ...]:
         """Cache key of the backbone: configurations with an equal key can share a loaded one."""
         return (
             self.backbone,
@@ -261,7 +261,7 @@ def get_extractor_config(name: str, *, allow_test_extractors: bool) -> Extractor
 def pooled_config(config: ExtractorConfig) -> ExtractorConfig:
     """Return the configuration of a VLAD extractor with GeM pooling instead.
 
-    It has the same local features and preprocessing, and needs no vocabulary.
+    It has the same patch features and preprocessing, and needs no vocabulary.
     """
     base, _, options = config.name.partition(":")
     shared = [

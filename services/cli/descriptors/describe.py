@@ -76,7 +76,7 @@ def describe(
     ] = None,
     aggregator: Annotated[
         str | None,
-        typer.Option(help=f"Aggregation of local features: {', '.join(EXTRACTOR_AGGREGATORS)}."),
+        typer.Option(help=f"Aggregation of patch features: {', '.join(EXTRACTOR_AGGREGATORS)}."),
     ] = None,
     temperature: Annotated[
         float | None, typer.Option(help="Softmax temperature of soft-vlad. Default: 1.")

@@ -1,4 +1,4 @@
-"""Aggregators: local features of a photo to one descriptor.
+"""Aggregators: patch features of a photo to one descriptor.
 
 POOLINGS are those of pretrained backbones, AGGREGATORS those of the networks that `placewise train`
 trains, with the interface in `base`.

@@ -1,4 +1,4 @@
-"""Aggregators by pooling: average and GeM of local features; AVG, GeM, CosPlace, Conv-AP of maps.
+"""Aggregators by pooling: average and GeM of patch features; AVG, GeM, CosPlace, Conv-AP of maps.
 
     AVG:  row_d = mean over the positions of x_d
     GeM:  row_d = (mean over the positions of max(x_d, eps)^p)^(1 / p)

@@ -1,4 +1,4 @@
-"""Backbones: networks that compute dense local features of photos.
+"""Backbones: networks that compute dense patch features of photos.
 
 Each module of this package implements `Backbone` for one kind of network. The configurations of
 `shared.extractor_config` name its class, so that a new one needs no other registration.
@@ -36,7 +36,7 @@ class StoredWeights(NamedTuple):
 
 
 class Backbone(ABC):
-    """A pretrained network that computes local features of a batch of photos."""
+    """A pretrained network that computes patch features of a batch of photos."""
 
     name: str
     fingerprint: str
@@ -94,7 +94,7 @@ class Backbone(ABC):
 
     @abstractmethod
     def features(self, pixels: torch.Tensor) -> torch.Tensor:
-        """Compute the local features of a batch of photos.
+        """Compute the patch features of a batch of photos.
 
         Args:
             pixels: (B, H, W, 3) RGB, 0 to 255; uint8, or float32 if the preprocessing does not

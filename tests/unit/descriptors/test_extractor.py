@@ -170,7 +170,7 @@ def test_photos_of_one_size_pass_together_and_of_large_ones_fewer(
     assert passes == [(2, 224, 224), (1, 224, 224), (1, 112, 448), (1, 448, 448), (1, 448, 448)]
     for photo, row in zip(photos, together, strict=True):
         np.testing.assert_allclose(made.describe([photo], None)[0], row, atol=1e-6)
-    local = made.local_features(photos)
+    local = made.patch_features(photos)
     assert [len(one) for one in local] == [height * width // 16 for height, width in shapes]
     for photo, one in zip(photos, local, strict=True):
         np.testing.assert_allclose(made.features(photo[None])[0], one, atol=1e-6)

@@ -86,7 +86,7 @@ def test_photo_that_does_not_fit_alone_is_an_error_that_names_it() -> None:
     with pytest.raises(PhotoTooLargeForGpu, match="448 x 448 pixels") as described:
         on(backbone).describe(mixed, None)
     with pytest.raises(PhotoTooLargeForGpu, match="448 x 448 pixels") as sampled:
-        on(backbone).local_features(mixed)
+        on(backbone).patch_features(mixed)
     for caught in (described.value, sampled.value):
         assert (caught.code, caught.place) == ("gpu_out_of_memory", 2)
         assert caught.as_problem()["status"] == 422

@@ -159,7 +159,7 @@ def test_slow_extractor_takes_its_time_and_width_from_its_name() -> None:
     assert (found.milliseconds, found.dimension) == (500, 98_304)
     for other in ("test-slow-avg", "test-slow-avg:width=98304", "test-slow-avg:milliseconds=500"):
         config = get_extractor_config(other, allow_test_extractors=True)
-        assert config.local_features != found.local_features
+        assert config.backbone_key != found.backbone_key
 
 
 @pytest.mark.parametrize("option", ["width=15", "width=131073", "milliseconds=60001"])
@@ -207,11 +207,11 @@ def test_preprocessings_are_those_that_vision_has() -> None:
 
 
 def test_only_what_changes_the_local_features_needs_another_backbone() -> None:
-    own = config("anyloc-vitb14").local_features
+    own = config("anyloc-vitb14").backbone_key
     for option in ("clusters=8", "aggregator=gem", "preprocessing=demo1024"):
-        assert config(f"anyloc-vitb14:{option}").local_features == own
+        assert config(f"anyloc-vitb14:{option}").backbone_key == own
     for other in ("anyloc-vitb14:layer=9", "anyloc-vitb14:facet=key", "anyloc-vits14"):
-        assert config(other).local_features != own
+        assert config(other).backbone_key != own
 
 
 def test_extractors_are_chosen_without_torch() -> None:
@@ -238,6 +238,6 @@ def test_the_pooled_form_of_a_vlad_extractor_keeps_its_local_features(
 ) -> None:
     found = pooled_config(config(name))
     assert found.name == pooled
-    assert found.local_features == config(name).local_features
+    assert found.backbone_key == config(name).backbone_key
     assert found.preprocessing == config(name).preprocessing
     assert not found.needs_vocabulary

@@ -130,5 +130,5 @@ def test_networks_share_what_is_loaded_only_if_all_of_the_name_agrees() -> None:
     one = get_extractor_config(f"{REPOSITORY}:x=1", allow_test_extractors=False)
     same = get_extractor_config(f"{REPOSITORY}:x=01", allow_test_extractors=False)
     other = get_extractor_config(f"{REPOSITORY}:x=2", allow_test_extractors=False)
-    assert one.local_features == same.local_features != other.local_features
+    assert one.backbone_key == same.backbone_key != other.backbone_key
     assert (one.dimension, one.needs_vocabulary) == (None, False)

@@ -35,7 +35,7 @@ def test_only_the_loaded_model_knows_how_photos_are_resized() -> None:
     assert (config.name, config.aggregator) == ("gsv:walks", "none")
     assert (config.width, config.dimension, config.preprocessing) == (None, None, None)
     other = get_extractor_config("gsv:nights", allow_test_extractors=False)
-    assert config.local_features != other.local_features
+    assert config.backbone_key != other.backbone_key
 
 
 def test_maps_use_models_that_were_added_and_no_files(monkeypatch: pytest.MonkeyPatch) -> None:

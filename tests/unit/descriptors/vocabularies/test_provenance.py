@@ -1,4 +1,4 @@
-"""A vocabulary is used with the local features that it was learnt from, or refused."""
+"""A vocabulary is used with the patch features that it was learnt from, or refused."""
 
 from __future__ import annotations
 

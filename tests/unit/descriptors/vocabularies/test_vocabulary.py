@@ -71,7 +71,7 @@ def with_row(index: int, row: Any, dtype: str = "float32") -> NDArray[Any]:
         (with_row(0, 1e300, "float64"), "NaN or infinite"),
         (with_row(2, 0), "centre 2 is zero"),
         (with_row(3, good_centres()[0]), "only 3 of its 4 centres are distinct"),
-        (good_centres(width=7), "7 dimensions, the extractor's local features 6"),
+        (good_centres(width=7), "7 dimensions, the extractor's patch features 6"),
         *((np.ones(shape), "its shape is") for shape in ((), (6,), (2, 3, 4), (0, 6), (4, 0))),
         *((good_centres().astype(dtype), "not floating point") for dtype in ("i8", "c8", "S4")),
     ],
