@@ -14,6 +14,10 @@ database photos only, as that of a live map is, and judged
 - on the set's queries with a quarter of the map's second coarsest labels left out, such as floors,
   four times: how many of the photos of these labels get an answer.
 
+If the labels are paths, the photos of each second coarsest label are then followed as a walk, in
+the order of their names, which end with a number of seconds: its queries through the whole map, and
+all its photos through the map without this label.
+
 Intervals are those of the cluster bootstrap (`shared/evaluation/bootstrap.py`).
 """
 
@@ -21,9 +25,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,8 +38,16 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from lab.benchmarks.report import Report, printed_report
+from lab.datasets.dataset import EvaluationSet
+from lab.datasets.ground_truth import find_positives, parse_rule
 from lab.datasets.open_dataset import open_evaluation_set
 from lab.evaluation.query_clusters import cluster_queries
+from lab.evaluation.sequences import (
+    FrameResult,
+    evaluate_sequence,
+    prepare_map,
+    sequence_figures,
+)
 from services.cli.environment import read_settings
 from services.cli.output import JsonOption, Table
 from shared.errors import Misconfigured
@@ -51,6 +64,7 @@ from shared.evaluation.places.samples import (
     attach_matches,
 )
 from shared.place_paths import label_levels
+from shared.tracks.motion import MOTION_MODELS
 
 CERTAINTY = 0.95
 LEFT_OUT_GROUPS = 4
@@ -72,9 +86,10 @@ class DescribedPhotos:
     """(n,) clusters of the bootstrap"""
     scheme: LevelScheme
     radius_m: float
-    paths: Sequence[Path]
     match: MatchOwnPhoto | None = None
     """compares photos of the set; None for estimates without matches"""
+    dataset: EvaluationSet | None = None
+    """the set, for its walks"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +167,8 @@ def measure_set(report: Report, photos: DescribedPhotos, splits: int, progress: 
         progress.advance(bar)
     if left_out:
         add_left_out(report, f"{photos.name}, labels left out", left_out)
+    if photos.dataset is not None and photos.scheme.labels_are_paths:
+        add_walks(report, photos.dataset, photos)
 
 
 def describe_set(folder: Path, progress: Progress) -> DescribedPhotos:
@@ -178,7 +195,7 @@ def describe_set(folder: Path, progress: Progress) -> DescribedPhotos:
         cluster_queries(photos).labels,
         LevelScheme(labels_are_paths=is_path, radii_m=settings.level_radii_m),
         settings.estimate_radius_m,
-        [photo.path for photo in photos],
+        dataset,
     )
 
 
@@ -290,6 +307,45 @@ def left_out_labels(photos: DescribedPhotos) -> Iterable[Mask]:
     names = sorted({*labels.tolist()} - {""})
     for group in range(LEFT_OUT_GROUPS if len(names) > LEFT_OUT_GROUPS else 0):
         yield np.isin(labels, names[group::LEFT_OUT_GROUPS])
+
+
+def add_walks(report: Report, dataset: EvaluationSet, photos: DescribedPhotos) -> None:
+    """Report what tracks claim on floors that the map has, and on floors that it lacks."""
+    frames = [*dataset.database, *dataset.queries]
+    floors = np.array([label_levels(frame.place, True)[-2:][0] for frame in frames])
+    queries, missing = [], []
+    for floor in sorted({*floors.tolist()}):
+        there = floors == floor
+        queries.append(_follow(dataset, photos, ~photos.is_query, photos.is_query & there))
+        missing += _follow(dataset, photos, ~photos.is_query & ~there, there)
+    figures, what = sequence_figures(queries), f"{dataset.name}, walks of its queries"
+    report.add(f"{what}: tracking", 100 * figures["tracking"], "%")
+    right = figures["tracking_precision"]
+    report.add(f"{what}: right among them", 100 * (right or 0.0), "%", at_least=100 * CERTAINTY)
+    tracked = 100 * float(np.mean([frame.status == "tracking" for frame in missing]))
+    what = f"{dataset.name}, walks on floors left out"
+    report.add(f"{what}: tracking", tracked, "%", at_most=100 * (1 - CERTAINTY))
+
+
+def _follow(
+    dataset: EvaluationSet, photos: DescribedPhotos, in_map: Mask, walked: Mask
+) -> list[FrameResult]:
+    """Follow the photos of a walk through a map of some of the photos."""
+    every = [*dataset.database, *dataset.queries]
+    database = tuple(every[n] for n in np.flatnonzero(in_map))
+    walk = sorted(np.flatnonzero(walked).tolist(), key=lambda n: every[n].path.name)
+    stems = [every[n].path.stem for n in walk]
+    numbers = [int("0" + stem[len(stem.rstrip("0123456789")) :]) for stem in stems]
+    steps = [max(1, after - before) for before, after in pairwise(numbers)]
+    seconds = np.cumsum([0, *steps]).tolist()
+    queries = tuple(
+        replace(every[n], frame=second) for n, second in zip(walk, seconds, strict=True)
+    )
+    positives = tuple(find_positives(parse_rule(dataset.rule), queries, database))
+    walked_set = replace(dataset, database=database, queries=queries, positives=positives)
+    motion = MOTION_MODELS["walk"]
+    map_ = prepare_map(walked_set, photos.rows[in_map], motion)
+    return evaluate_sequence(map_, walked_set, range(len(walk)), photos.rows[walk], motion)[0]
 
 
 def add_judged(report: Report, what: str, judged: Sequence[Judged]) -> None:

@@ -110,8 +110,10 @@ def bench(
     with printed_report(f"matches of {name}", as_json) as (report, progress):
         for folder in folders or [Path(os.environ["PLACEWISE_TEST_DATA"]) / "tower"]:
             photos = describe_set(folder, progress)
-            bar = progress.add_task(f"{photos.name}: local features", total=len(photos.paths))
-            features, seconds = detect_all(loaded, photos.paths, partial(progress.advance, bar))
+            assert photos.dataset is not None
+            paths = [p.path for p in (*photos.dataset.database, *photos.dataset.queries)]
+            bar = progress.add_task(f"{photos.name}: local features", total=len(paths))
+            features, seconds = detect_all(loaded, paths, partial(progress.advance, bar))
             matched = MatchedPhotos(features, matcher)
             compare(report, photos, matched)
             add_cost(report, photos.name, matched, seconds)

@@ -8,7 +8,7 @@ descriptors; the filter searches with the earlier frames as the background, as t
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
@@ -21,9 +21,14 @@ from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.datasets.ground_truth import parse_rule
 from lab.evaluation.array_photo_graph import ArrayPhotoGraph
 from lab.evaluation.confidence_metrics import recall_at_precision
+from lab.evaluation.places import RANKS, SAMPLED_PHOTOS
 from lab.evaluation.seqslam import hmm_matches, seqslam_matches
 from shared.evaluation.calibration import expected_calibration_error
+from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
+from shared.evaluation.places.fit import fit_place_model
 from shared.evaluation.places.levels import LevelScheme
+from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
+from shared.place_paths import look_like_paths
 from shared.search_api.background import PRIOR_ROWS, background_frames
 from shared.tracks.belief import Belief, TrackStatus
 from shared.tracks.evidence import HITS, FrameEvidence, frame_evidence
@@ -77,6 +82,8 @@ class SequenceMap:
     """(n, D), of unit length"""
     graph: ArrayPhotoGraph
     scheme: LevelScheme
+    judge: Callable[[NDArray[np.float32]], float | None]
+    """returns the log-odds that the map lacks a frame's place, from its (n,) scores"""
 
     @property
     def has_coordinates(self) -> bool:
@@ -85,7 +92,7 @@ class SequenceMap:
 
 
 def prepare_map(evaluation_set: EvaluationSet, rows: Rows, motion: MotionModel) -> SequenceMap:
-    """Build the photo graph.
+    """Build the photo graph, and fit the place model of a map with labels.
 
     Args:
         evaluation_set: The set; its rule is the tolerance.
@@ -98,7 +105,9 @@ def prepare_map(evaluation_set: EvaluationSet, rows: Rows, motion: MotionModel) 
     if rule.kind != "frames":
         finest = rule.radius_m
     coarser = tuple(radius for radius in COARSE_RADII_M if radius > finest)
-    scheme = LevelScheme(labels_are_paths=False, radii_m=(finest, *coarser))
+    labels = {photo.place for photo in photos if photo.latitude is None} - {None}
+    is_path = look_like_paths([label for label in labels if label is not None])
+    scheme = LevelScheme(labels_are_paths=is_path, radii_m=(finest, *coarser))
     table = PhotoTable.of_rows(
         (
             str(number),
@@ -111,7 +120,36 @@ def prepare_map(evaluation_set: EvaluationSet, rows: Rows, motion: MotionModel) 
         )
         for number, photo in enumerate(photos)
     )
-    return SequenceMap(photos, rows, ArrayPhotoGraph(table), scheme)
+    judge = _fit_judge(photos, rows, scheme, rule.radius_m) if labels else lambda _: None
+    return SequenceMap(photos, rows, ArrayPhotoGraph(table), scheme, judge)
+
+
+def _fit_judge(
+    photos: Sequence[DatasetPhoto], rows: Rows, scheme: LevelScheme, radius_m: float
+) -> Callable[[NDArray[np.float32]], float | None]:
+    locations = [PhotoLocation(photo.latitude, photo.longitude, photo.place) for photo in photos]
+
+    def rank(photo: int) -> IndexRanking:
+        scores = rows @ rows[photo]
+        order = np.argsort(-scores, kind="stable")[: RANKS + 1]
+        order = order[order != photo]
+        return order, scores[order].astype(np.float64)
+
+    times = [photo.captured_at for photo in photos]
+    own_photos = OwnPhotoSampler(locations, times, scheme, radius_m, rank)
+    known = np.flatnonzero([location.is_known for location in locations])
+    size = min(SAMPLED_PHOTOS, len(known))
+    sample = np.sort(np.random.default_rng(0).choice(known, size, replace=False)).tolist()
+    spread = own_photos.spread(sample)
+    model = fit_place_model(list(own_photos.samples(sample, spread)), (), scheme, spread).model
+
+    def judge(scores: NDArray[np.float32]) -> float | None:
+        order = np.argsort(-scores, kind="stable")
+        first = order[np.isin(order, known)][:EVIDENCE_DEPTH].tolist()
+        ranking = [RankedPhoto(float(scores[n]), locations[n], n) for n in first]
+        return model.missing_log_odds(ranking, own_photos.neighbours(first[0]), scheme, radius_m)
+
+    return judge
 
 
 def split_sequences(queries: Sequence[DatasetPhoto]) -> list[list[int]]:
@@ -249,7 +287,8 @@ def _frames_of(map_: SequenceMap, times: Sequence[datetime], scores: Rows) -> li
         centred = own - scores[background].sum(axis=0) / (len(background) + PRIOR_ROWS)
         order = np.argsort(-centred, kind="stable")[:count]
         found = centred[order].astype(np.float64).tolist()
-        frames.append(frame_evidence(time_, [str(photo) for photo in order], found, len(own)))
+        ids = [str(photo) for photo in order]
+        frames.append(frame_evidence(time_, ids, found, len(own), missing=map_.judge(own)))
     return frames
 
 
@@ -327,20 +366,14 @@ def sequence_figures(sequences: Sequence[Sequence[FrameResult]]) -> dict[str, An
             for name in ("single", "seqslam", "hmm", "filter", "smoothed")
         },
         "recall_at_99_precision": {
-            "single": recall_at_precision(
-                [frame.single_score for frame in frames],
-                [frame.single_is_right for frame in frames],
+            name: recall_at_precision(
+                [getattr(frame, score) for frame in frames],
+                [getattr(frame, f"{name}_is_right") for frame in frames],
                 len(inside),
             )
             if inside
-            else None,
-            "filter": recall_at_precision(
-                [frame.probability for frame in frames],
-                [frame.filter_is_right for frame in frames],
-                len(inside),
-            )
-            if inside
-            else None,
+            else None
+            for name, score in (("single", "single_score"), ("filter", "probability"))
         },
         "tracking": _share([frame.status == "tracking" for frame in inside]),
         "tracking_precision": _share([frame.filter_is_right for frame in tracked]),

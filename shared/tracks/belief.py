@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 MAX_BYTES = 1_000_000
 START_GAIN = 0.5
 """`gain` before the first frame, cautious"""
@@ -44,6 +44,10 @@ class Belief:
     """number of independent, tracked frames that `gain` is the mean of"""
     pace: float = 1.0
     """seconds along the map's sequences for each second of the track, negative backwards"""
+    position: tuple[float, float] | None = None
+    """latitude and longitude, if they are known"""
+    velocity: tuple[float, float] = (0.0, 0.0)
+    """degrees of latitude and longitude per second"""
     direction: float = 0.0
     """log-likelihood of the frames so far if the camera moves along the map's sequence as it did,
     relative to the opposite direction; the oldest frames fade"""

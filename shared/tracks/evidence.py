@@ -78,6 +78,8 @@ class FrameEvidence(_Frozen):
 
     time: AwareDatetime
     hits: tuple[Hit, ...] = ()
+    missing: float | None = None
+    """`PlaceModel.missing_log_odds`"""
     fix: PositionFix | None = None
     odometry: Odometry | None = None
 
@@ -88,6 +90,7 @@ def frame_evidence(
     scores: Sequence[float],
     photo_count: int,
     *,
+    missing: float | None = None,
     fix: PositionFix | None = None,
     odometry: Odometry | None = None,
 ) -> FrameEvidence:
@@ -98,6 +101,7 @@ def frame_evidence(
         photos: (k,) ids of the first photos of the map.
         scores: (k,) their scores, highest first.
         photo_count: Number of photos of the map, at least k.
+        missing: `PlaceModel.missing_log_odds`, of a search without background.
         fix: A position measured at the same time.
         odometry: Motion since the frame before.
     """
@@ -106,7 +110,7 @@ def frame_evidence(
         Hit(photo=photo, score=score, probability=probability)
         for photo, score, probability in zip(photos, scores, shares.tolist(), strict=True)
     )
-    return FrameEvidence(time=time, hits=hits, fix=fix, odometry=odometry)
+    return FrameEvidence(time=time, hits=hits, missing=missing, fix=fix, odometry=odometry)
 
 
 def rank_shares(scores: FloatArray, photo_count: int) -> tuple[FloatArray, float]:

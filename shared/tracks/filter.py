@@ -23,6 +23,12 @@ by chance only, yet better than any place: similar streets look similar in succe
 prediction, log(sum_j p'(j) (n q(j)) ** w / sum_j p'(j)) / w. Where the evidence is weak, g is near
 what frames gain by chance, and little speaks for "outside".
 
+Labels leave the frames of a missing floor free to agree on another one. There the place model of
+the map counts instead, which says how much a frame alone looks like one that the map lacks, with
+log-odds m (`PlaceModel.missing_log_odds`):
+
+    outside   ~ outside' * sum_j p'(j) (n q(j)) ** w / sum_j p'(j) * exp(w * m)
+
 Two frames of the same view are not independent, so w = min(1, NEWS_WEIGHT * news), and news is the
 share of the evidence that is new: the squared Hellinger distance 1 - sum_j sqrt(d(j) d_before(j))
 of what exceeds the prior, d(j) ~ max(q(j) - 1 / n, 0), from the frame before. A camera that stands
@@ -41,15 +47,16 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
-from shared.geodesy import EARTH_RADIUS_M
+from shared.geodesy import EARTH_RADIUS_M, distance_m
+from shared.place_paths import label_levels
 from shared.tracks.belief import Belief
 from shared.tracks.evidence import FrameEvidence, Odometry, PositionFix
 from shared.tracks.motion import DEFAULT_MOTION, MotionModel
@@ -76,6 +83,10 @@ OUTSIDE_GAIN = 0.7
 """Share of the track's gain above CHANCE_GAIN that a frame outside the map must fall below"""
 CHANCE_GAIN = 0.45
 """A track that gains no more than this by its frames is not distinguishable from one outside"""
+MAX_MISSING = 4.0
+"""Log-odds that a single frame speaks for or against "outside", at most"""
+START_OUTSIDE = 0.3
+"""Probability that a camera whose place is a label is outside the map at first"""
 MAX_GAIN = 2.0
 """Where most frames gain more, one in a tunnel gains far less, and is still in the map"""
 MAX_GAIN_WEIGHT = 200.0
@@ -85,10 +96,14 @@ NEWS_WEIGHT = 1.5
 STRETCH_SECONDS = 5.0
 """of a map's sequence before and after a photo. How they share the evidence of a stretch counts in
 full even where the camera sees nothing new, so that a camera that stands is not moved on"""
-PACE_SPREAD = 1.0
+PACE_SPREAD = 0.7
 """Standard deviation of a camera's pace around the learned one, in paces of the map"""
 PACE_FRAMES = 30.0
 """Number of tracked frames that the pace is the mean of"""
+VELOCITY_FRAMES = 6.0
+"""Number of tracked frames that the velocity along coordinates is the mean of: streets turn"""
+SIBLINGS_M = 20.0
+"""Between two places that have the parent in common in the map's label paths"""
 DIRECTION_FRAMES = 50.0
 """Number of frames with new evidence that say whether the camera moves along the map"""
 SPACING_M = 10.0
@@ -174,7 +189,7 @@ class TrackFilter:
         Raises:
             ValueError: The frame is older than the belief.
         """
-        return self._step(belief or _start(evidence.time), evidence).belief
+        return self._step(belief or _start(evidence), evidence).belief
 
     def state(self, belief: Belief) -> TrackState:
         """Return where the camera is according to a belief."""
@@ -197,7 +212,7 @@ class TrackFilter:
         steps: list[_Step] = []
         smoothed: list[Belief] = []
         for frame in frames:
-            before = steps[-1].belief if steps else start or _start(frame.time)
+            before = steps[-1].belief if steps else start or _start(frame)
             steps.append(self._step(before, frame))
             if len(steps) == SMOOTHED_AT_ONCE + LATER_FRAMES:
                 smoothed += _backward(steps, count)[:SMOOTHED_AT_ONCE]
@@ -240,12 +255,13 @@ class TrackFilter:
         if evidence.fix is not None:
             near_fix, fix_complete_m = _near_fix(self._graph, evidence.fix)
             targets = targets.union(near_fix)
-        kernel = self._kernel(sources, targets, complete_m, seconds, evidence, before.pace)
-        backwards = None
-        if follows_sequence(targets).any():
-            backwards = self._kernel(sources, targets, complete_m, seconds, evidence, -before.pace)
         seen = _excess(evidence, count)
         weight = min(1.0, NEWS_WEIGHT * _news(before.seen, seen))
+        # A camera that sees nothing new has not moved on.
+        drift = weight * seconds * np.array(before.velocity)
+        reached = partial(self._kernel, sources, targets, complete_m, seconds, evidence, drift)
+        kernel = reached(before.pace)
+        backwards = reached(-before.pace) if follows_sequence(targets).any() else None
 
         # Photos that were deleted since have given their probability to the others.
         own = before.probabilities[rows]
@@ -279,6 +295,9 @@ class TrackFilter:
             direction = max(0.0, direction * (1 - weight / DIRECTION_FRAMES) + gained)
         outside_gain = OUTSIDE_GAIN * max(0.0, min(before.gain, MAX_GAIN) - CHANCE_GAIN)
         weight_outside = np.exp(weight * outside_gain) if evidence.hits else 1.0
+        if evidence.missing is not None:
+            log_odds = float(np.clip(evidence.missing, -MAX_MISSING, MAX_MISSING))
+            weight_outside = fit / max(in_map, sys.float_info.min) * math.exp(weight * log_odds)
         if evidence.fix is not None:
             near, elsewhere_near = _fix_weights(targets, evidence.fix, fix_complete_m, count)
             weights, weight_elsewhere = weights * near, weight_elsewhere * elsewhere_near
@@ -298,6 +317,8 @@ class TrackFilter:
             gain=before.gain,
             gain_weight=before.gain_weight,
             pace=before.pace,
+            position=before.position,
+            velocity=before.velocity,
             direction=direction,
             status=before.status,
             frames=before.frames + 1,
@@ -307,6 +328,7 @@ class TrackFilter:
         after = self._learn_pace(
             after, _place(sources, own), _place(targets.take(kept), posterior[kept]), seconds
         )
+        after = self._learn_velocity(after, state, seconds)
         if evidence.hits and in_map > 0:
             after = _learn_gain(after, float(np.log(fit / in_map)), weight, state.probability)
         return _Step(
@@ -338,6 +360,29 @@ class TrackFilter:
         pace = belief.pace + certainty * (seen - belief.pace) / PACE_FRAMES
         return replace(belief, pace=float(np.clip(pace, -limit, limit)))
 
+    def _learn_velocity(self, belief: Belief, state: TrackState, seconds: float) -> Belief:
+        """Move the velocity of a belief towards that from its position to that of the state."""
+        known = state.latitude is not None and state.longitude is not None
+        if not known or state.probability < 0.5:
+            return replace(belief, position=None)
+        here = np.array([state.latitude, state.longitude], dtype=np.float64)
+        if belief.position is None or seconds <= 0:
+            return replace(belief, position=tuple(here.tolist()))
+        before, velocity = np.array(belief.position), np.array(belief.velocity)
+        seen = np.remainder(here - before + 180, 360) - 180
+        if distance_m(*before, *here) > self._motion.max_speed_mps * seconds + SPACING_M:
+            velocity[:] = 0.0  # carried away
+        else:
+            velocity += state.probability * (seen / seconds - velocity) / VELOCITY_FRAMES
+        return replace(belief, position=tuple(here.tolist()), velocity=tuple(velocity.tolist()))
+
+    def _distances_m(self, sources: PhotoTable, targets: PhotoTable) -> FloatArray:
+        """Return (n, m) distances; the places of a parent are near each other."""
+        away = distance_matrix_m(sources, targets, self._motion.typical_speed_mps)
+        if self._scheme.labels_are_paths:
+            away[np.isinf(away) & _are_siblings(sources, targets)] = SIBLINGS_M
+        return away
+
     def _reach_m(self, seconds: float, odometry: Odometry | None) -> float:
         if odometry is not None:
             return odometry.distance_m + 3 * (odometry.distance_accuracy_m + SPACING_M)
@@ -368,6 +413,7 @@ class TrackFilter:
         complete_m: float,
         seconds: float,
         evidence: FrameEvidence,
+        drift: FloatArray,
         pace: float,
     ) -> FloatArray:
         """Return (n, m) probabilities to move from source to target photos.
@@ -385,6 +431,7 @@ class TrackFilter:
                 complete_m,
                 seconds,
                 evidence.odometry,
+                drift,
                 pace,
             )
             kernel[rows, rows] += 1 - moving  # the sources are the first targets
@@ -398,6 +445,7 @@ class TrackFilter:
         complete_m: float,
         seconds: float,
         odometry: Odometry | None,
+        drift: FloatArray,
         pace: float,
     ) -> tuple[FloatArray, FloatArray]:
         """Return (n, m) probabilities to move, and (n,) how probable it is to move at all.
@@ -405,13 +453,18 @@ class TrackFilter:
         The photos are coarser than the motion between two frames, so a camera changes its photo
         only so often that it moves no farther than it can on average.
         """
-        away = distance_matrix_m(sources, targets, self._motion.typical_speed_mps)
+        away = self._distances_m(sources, targets)
         reach_m = min(self._reach_m(seconds, odometry), MAX_REACH_M)
         if odometry is None:
             moved_m = self._motion.max_speed_mps * seconds
             width = float(np.hypot(SPACING_M, moved_m / 2))
             weigh = partial(_gaussian, width=width)
-            kernel = weigh(away)
+            moved = replace(
+                sources,
+                latitudes=sources.latitudes + drift[0],
+                longitudes=sources.longitudes + drift[1],
+            )
+            kernel = weigh(self._distances_m(moved, targets) if drift.any() else away)
             gaps = _gaps_along(sources, targets, away, self._motion.typical_speed_mps)
             typical_m = self._motion.typical_speed_mps * seconds
             along = _gaussian(
@@ -445,8 +498,9 @@ class TrackFilter:
         return kernel * moving[:, None], moving
 
 
-def _start(time: datetime) -> Belief:
-    return Belief(time, (), np.zeros(0), 1 - OUT_OF_MAP_SHARE, OUT_OF_MAP_SHARE, {})
+def _start(first: FrameEvidence) -> Belief:
+    outside = OUT_OF_MAP_SHARE if first.missing is None else START_OUTSIDE
+    return Belief(first.time, (), np.zeros(0), 1 - outside, outside, {})
 
 
 def _photos_of_targets(
@@ -486,6 +540,15 @@ def _gaps_along(
     located = ~np.isnan(sources.latitudes)[:, None] & ~np.isnan(targets.latitudes)
     gaps[located | (np.abs(gaps) > away)] = np.nan
     return gaps
+
+
+def _are_siblings(sources: PhotoTable, targets: PhotoTable) -> NDArray[np.bool_]:
+    """Return (n, m) whether the labels of two photos are paths with the same parent."""
+    paths = [label_levels(place, True) for place in (*sources.places, *targets.places)]
+    parents = np.array([path[1] if len(path) > 1 else "" for path in paths])
+    first, second = parents[: len(sources), None], parents[None, len(sources) :]
+    siblings: NDArray[np.bool_] = (first == second) & (first != "")
+    return siblings
 
 
 def _odometry_weights(away: FloatArray, odometry: Odometry) -> FloatArray:

@@ -453,6 +453,24 @@ def rank_live_photos(gateway: GatewayContext, query: SimilarityQuery, k: int) ->
     return _MapSearch(gateway, query, Mode.AUTO, weights).find(NO_FILTER, k).hits
 
 
+def missing_log_odds(gateway: GatewayContext, query: SimilarityQuery) -> float | None:
+    """Return `PlaceModel.missing_log_odds` of a query; None before the map is evaluated."""
+    if query.generation.calibration is None:
+        return None
+    weights = select_ranking_weights(query.generation, True)
+    scheme = LevelScheme(
+        labels_are_paths=query.map.place_labels_are_paths, radii_m=gateway.settings.level_radii_m
+    )
+    search = _MapSearch(gateway, query, Mode.AUTO, weights.values)
+    found = search.find(WITH_PLACE, EVIDENCE_DEPTH)
+    model = (weights.calibration(found.hits) or PlaceModel()).for_scheme(scheme)
+    if not found.hits:
+        return None
+    neighbours = search.rank_neighbours(found.hits[0].photo_id)
+    radius_m = gateway.settings.estimate_radius_m
+    return model.missing_log_odds(found.ranking, neighbours, scheme, radius_m)
+
+
 def _not_searchable_error(session: Session, photo: Photo, map_name: str) -> Conflict:
     """Build the 409 error: why the photo has no descriptor, and which job to poll."""
     job = session.get(Job, photo.job_id) if photo.job_id else None

@@ -18,7 +18,7 @@ from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 from services.gateway.dependencies import GatewayContext
-from services.gateway.similarity.execute import query_from_job, rank_live_photos
+from services.gateway.similarity.execute import missing_log_odds, query_from_job, rank_live_photos
 from services.gateway.tracks.catalog_graph import CatalogPhotoGraph
 from services.gateway.tracks.schemas import FrameForm, TrackParams, TrackStateResponse
 from services.gateway.uploads.query_photo import query_expired_error
@@ -133,6 +133,7 @@ def _search_evidence(gateway: GatewayContext, pending: _PendingFrame) -> FrameEv
         [str(hit.photo_id) for hit in hits],
         [hit.ranked_by for hit in hits],
         photo_count,
+        missing=missing_log_odds(gateway, query),
         fix=measured.fix(),
         odometry=measured.odometry(),
     )

@@ -153,6 +153,25 @@ class PlaceModel(BaseModel):
         missing = _probability(self.not_in_map or prior.not_in_map, levels[0], float(shift))
         return increasing, min(missing, 1 - increasing[0])
 
+    def missing_log_odds(
+        self,
+        ranking: Sequence[RankedPhoto],
+        neighbours: Sequence[RankedPhoto],
+        scheme: LevelScheme,
+        position_radius_m: float,
+    ) -> float | None:
+        """Return the log-odds of "not in the map" if half of the queries are from outside it.
+
+        Arguments are those of `estimate`. None without a fit, and for coordinates: in another
+        season, all queries look as if they were not in the map.
+        """
+        ranking, unit = ranking[:EVIDENCE_DEPTH], self.unit(ranking[:EVIDENCE_DEPTH])
+        near = neighbours[:EVIDENCE_DEPTH]
+        levels = candidate_levels(ranking, near, scheme, unit, position_radius_m)
+        if not self.is_fitted or not levels or levels[0].radius_m is not None:
+            return None
+        return _log_odds(self.not_in_map or shipped_prior().not_in_map, levels[0])
+
     def answer(
         self, probabilities: Sequence[float], not_in_map: float, certainty: float
     ) -> int | None:
@@ -270,8 +289,12 @@ def _match_probabilities(
 
 
 def _probability(coefficients: Coefficients, level: CandidateLevel, shift: float = 0.0) -> float:
+    return float(sigmoid(np.array(_log_odds(coefficients, level) + shift)))
+
+
+def _log_odds(coefficients: Coefficients, level: CandidateLevel) -> float:
     design = shipped_prior().design(level.features[None])
-    return float(sigmoid(design @ extended(coefficients, design.shape[1]) + shift)[0])
+    return float((design @ extended(coefficients, design.shape[1]))[0])
 
 
 def extended(coefficients: Coefficients, count: int) -> FloatArray:

@@ -21,8 +21,12 @@ from services.steward.tasks.maintenance import delete_old_tracks
 from shared.catalog import tracks as tracks_module
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
+from shared.catalog.generations import Generation
 from shared.catalog.jobs import Job
 from shared.catalog.tracks import Track, TrackFrame
+from shared.config.settings import Settings
+from shared.evaluation.places.levels import FEATURES
+from shared.evaluation.places.probability import PlaceModel
 from shared.search_api.protocol import SearchRequest, SearchResponse
 from shared.storage.keys import query_key, query_vector_key
 from tests.integration.in_process_api import Service
@@ -352,6 +356,27 @@ def test_a_track_of_places_follows_their_labels(service: Service) -> None:
     assert [f["state"]["place"] for f in track["frames"]] == ["room 0", "room 1", "room 2"]
     assert [level["place"] for level in track["state"]["levels"]] == ["room 2"]
     assert track["state"]["latitude"] is None
+
+
+@pytest.mark.databases("sqlite")
+def test_a_map_whose_place_model_finds_that_it_lacks_each_frame_is_not_tracked(
+    service: Service, catalog: Catalog
+) -> None:
+    for number in STREET:
+        service.upload(photo_bytes(number), place=f"room {number}")
+    service.drain()
+    outside = {}
+    for log_odds in (-3.0, 3.0):
+        model = PlaceModel(source="own_photos", not_in_map=(log_odds, *[0.0] * len(FEATURES)))
+        with catalog.write() as session:
+            session.execute(update(Generation).values(calibration=model.model_dump(mode="json")))
+        track_id = begin(service)
+        track = ride(service, track_id, 0, 1, 2)
+        outside[log_odds] = track["state"]["not_in_map_probability"]
+        smoothed = read(service, track_id, smoothed=True)["state"]
+        assert smoothed["not_in_map_probability"] == pytest.approx(outside[log_odds])
+    assert track["state"]["status"] == "lost"
+    assert outside[-3.0] < 0.05 < 0.95 < outside[3.0]
 
 
 @pytest.mark.databases("sqlite")

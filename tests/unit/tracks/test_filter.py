@@ -36,6 +36,7 @@ from tests.unit.tracks.maps import at, frame, line_map, pointing_at, sequence_ma
 pytestmark = pytest.mark.numerics
 
 COUNT = 4
+METRES_PER_DEGREE = np.radians(EARTH_RADIUS_M)
 WALK = MOTION_MODELS["walk"]
 
 
@@ -50,18 +51,14 @@ def random_frames(seed: int, steps: int) -> list[FrameEvidence]:
 
 def brute_force(frames: list[FrameEvidence]) -> NDArray[np.float64]:
     """(steps, photos + 1) smoothed probabilities over all paths; the last is "outside"."""
-    away = 10.0 * np.abs(np.subtract.outer(np.arange(COUNT), np.arange(COUNT)))
-    width = np.hypot(SPACING_M, WALK.max_speed_mps * 2.0 / 2)
-    kernel = np.exp(-0.5 * (away / width) ** 2)
-    kernel[away > WALK.max_speed_mps * 2.0 + 3 * SPACING_M] = 0.0
-    kernel /= kernel.sum(axis=1, keepdims=True)
-    moving = np.minimum(1, 2.0 * WALK.max_speed_mps / (kernel * away).sum(axis=1))[:, None]
-    kernel = moving * kernel + (1 - moving) * np.eye(COUNT)
+    east = 10.0 * np.subtract.outer(np.arange(COUNT), np.arange(COUNT)).T
+    away, width = np.abs(east), np.hypot(SPACING_M, WALK.max_speed_mps * 2.0 / 2)
     start = np.append(np.full(COUNT, (1 - OUT_OF_MAP_SHARE) / COUNT), OUT_OF_MAP_SHARE)
     shown = np.array([[hit.probability for hit in f.hits] for f in frames])
-    gains, belief = [], None
+    gains, velocities, belief = [], [], None
     for each in frames:
         gains.append(belief.gain if belief else START_GAIN)
+        velocities.append(belief.velocity[1] * METRES_PER_DEGREE if belief else 0.0)
         belief = TrackFilter(line_map(COUNT), WALK).advance(belief, each)
     outside = np.exp(OUTSIDE_GAIN * np.maximum(0.0, np.minimum(gains, MAX_GAIN) - CHANCE_GAIN))
     likelihood = np.column_stack([shown * COUNT, outside])
@@ -78,6 +75,11 @@ def brute_force(frames: list[FrameEvidence]) -> NDArray[np.float64]:
             rate * new[step] for rate in (CARRIED_AWAY, LEAVING, ENTERING)
         )
         # A first frame moves nothing: all photos are equally probable before it.
+        kernel = np.exp(-0.5 * ((east - 2.0 * new[step] * velocities[step]) / width) ** 2)
+        kernel[away > WALK.max_speed_mps * 2.0 + 3 * SPACING_M] = 0.0
+        kernel /= kernel.sum(axis=1, keepdims=True)
+        moving = np.minimum(1, 2.0 * WALK.max_speed_mps / (kernel * away).sum(axis=1))[:, None]
+        kernel = moving * kernel + (1 - moving) * np.eye(COUNT)
         walked = np.eye(COUNT) if step == 0 else kernel
         move[:COUNT, :COUNT] = (1 - carried - leaving) * walked + carried / COUNT
         move[:COUNT, COUNT] = leaving
@@ -195,7 +197,7 @@ def test_the_gain_is_learnt_from_tracked_frames_and_follows_the_light() -> None:
     track_filter, belief = TrackFilter(line_map(500), motion_model(15.0)), None
     gains = []
     for step in range(400):
-        shown = 0.5 if step < 100 else 0.1
+        shown = 0.5 if step < 100 else 0.05
         belief = track_filter.advance(belief, pointing_at(50 + step, 500, step, shown))
         gains.append(belief.gain)
     assert gains[0] < 1.0 < 2.0 < gains[99]
@@ -325,6 +327,69 @@ def test_frames_that_mislead_to_the_same_photos_of_a_sequence_are_not_tracked() 
     assert belief is not None
     assert statuses.count("tracking") < 9
     assert track_filter.state(belief).probability < 0.5
+
+
+def follow_rooms(
+    shown: list[int], missing: float | None = None
+) -> tuple[TrackFilter, list[Belief]]:
+    """Follow a walk through a house of 4 floors with 3 rooms each, of which 10 photos show each."""
+    rng = np.random.default_rng(4)
+    graph = ArrayPhotoGraph(
+        PhotoTable.of_rows(
+            (str(n), None, None, None, f"house/{n // 30}/{n // 10 % 3}", None, None)
+            for n in range(120)
+        )
+    )
+    scheme = LevelScheme(labels_are_paths=True, radii_m=(25.0,))
+    track_filter, belief, beliefs = TrackFilter(graph, WALK, scheme), None, []
+    for second, room in enumerate(shown):
+        shares = np.full(120, 0.5 / 110)
+        shares[10 * room : 10 * room + 10] = 0.5 * rng.dirichlet(np.full(10, 0.3))
+        each = frame(second, shares.tolist()).model_copy(update={"missing": missing})
+        belief = track_filter.advance(belief, each)
+        beliefs.append(belief)
+    return track_filter, beliefs
+
+
+def test_frames_that_agree_on_a_room_are_not_tracked_if_each_looks_foreign_to_the_map() -> None:
+    shown = [7] * 40
+    statuses = {
+        missing: [belief.status for belief in follow_rooms(shown, missing)[1]]
+        for missing in (None, -0.5, 0.5)
+    }
+    assert statuses[None].count("tracking") > 30
+    assert statuses[-0.5].count("tracking") > 25
+    assert statuses[0.5].count("tracking") == 0
+    track_filter, beliefs = follow_rooms(shown, 0.5)
+    assert beliefs[-1].outside > 0.9
+    frames = [frame(n, [1 / 120] * 120).model_copy(update={"missing": 0.5}) for n in range(40)]
+    assert {state.status for state in track_filter.smoothed_states(frames)} == {"lost"}
+
+
+def test_a_camera_goes_on_to_a_room_of_its_floor_sooner_than_to_one_of_another_floor() -> None:
+    changed = {}
+    for room in (1, 4):  # on the same floor, and on the next one
+        track_filter, beliefs = follow_rooms([0] * 15 + [room] * 10)
+        found = [track_filter.state(belief).place for belief in beliefs[15:]]
+        changed[room] = found.index(f"house/{room // 3}/{room % 3}")
+    assert changed[1] < changed[4]
+
+
+def test_a_camera_is_expected_to_go_on_as_it_did_unless_it_sees_nothing_new() -> None:
+    track_filter, belief = TrackFilter(line_map(200), motion_model(15.0)), None
+    for step in range(20):
+        belief = track_filter.advance(belief, pointing_at(50 + step, 200, step, 0.3))
+    assert belief is not None
+    assert belief.velocity[1] * METRES_PER_DEGREE == pytest.approx(10.0, abs=3.0)
+
+    def mean_photo(after: Belief) -> float:
+        return float(after.probabilities @ [int(photo) for photo in after.photos])
+
+    before, blind, still = mean_photo(belief), FrameEvidence(time=at(20)), belief
+    assert mean_photo(track_filter.advance(belief, blind)) > before + 0.5
+    for step in range(20, 50):
+        still = track_filter.advance(still, pointing_at(69, 200, step, 0.3))
+    assert track_filter.state(still).photo in {"68", "69", "70"}
 
 
 @pytest.mark.parametrize("seed", range(20))

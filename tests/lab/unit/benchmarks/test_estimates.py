@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,13 @@ from lab.benchmarks.estimates import (
     DescribedPhotos,
     add_judged,
     add_left_out,
+    add_walks,
     draw,
     fit_and_judge,
     left_out_labels,
 )
 from lab.benchmarks.report import Report
+from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from services.cli.main import build_app
 from shared.errors import Misconfigured
 from shared.evaluation.places.evidence import PhotoLocation
@@ -28,22 +31,21 @@ from shared.evaluation.places.levels import LevelScheme
 PLACES, PER_PLACE, FLOORS = 24, 6, 8
 
 
-def described() -> DescribedPhotos:
+def described(per_place: int = PER_PLACE) -> DescribedPhotos:
     rng = np.random.default_rng(0)
-    rows = np.repeat(rng.normal(size=(PLACES, 16)), PER_PLACE, 0)
+    rows = np.repeat(rng.normal(size=(PLACES, 16)), per_place, 0)
     rows += 0.3 * rng.normal(size=rows.shape)
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    places = [f"house/{n % FLOORS}/{n}" for n in range(PLACES) for _ in range(PER_PLACE)]
+    places = [f"house/{n % FLOORS}/{n}" for n in range(PLACES) for _ in range(per_place)]
     return DescribedPhotos(
         "house",
         rows.astype(np.float32),
         [PhotoLocation(None, None, place) for place in places],
         [None] * len(places),
-        np.arange(len(places)) % PER_PLACE == 0,
-        np.arange(len(places)) // PER_PLACE,
+        np.arange(len(places)) % per_place == 0,
+        np.arange(len(places)) // per_place,
         LevelScheme(labels_are_paths=True, radii_m=(25.0,)),
         25.0,
-        [Path(f"{number}.jpg") for number in range(len(places))],
     )
 
 
@@ -68,6 +70,24 @@ def test_labelled_queries_calibrate_the_estimates_of_the_others() -> None:
     assert [j.cluster for j in judged] == list(range(PLACES))
     without = fit_and_judge(photos, in_map, photos.is_query)
     assert judged[0].estimate.probabilities != without[0].estimate.probabilities
+
+
+def test_walks_are_tracked_on_floors_of_the_map_and_not_on_floors_that_it_lacks() -> None:
+    photos, report = described(20), Report("estimates")
+    every = [
+        DatasetPhoto(Path(f"{n:03d}.jpg"), "", place=spot.place)
+        for n, spot in enumerate(photos.locations)
+    ]
+    is_query = np.arange(len(every)) % 2 == 1
+    database, queries = (tuple(every[n] for n in np.flatnonzero(m)) for m in (~is_query, is_query))
+    none = (np.zeros(0, np.int64),) * len(queries)
+    dataset = EvaluationSet("house", Path(), database, queries, none, "place-label", "placewise")
+    order = np.argsort(is_query, kind="stable")
+    add_walks(report, dataset, replace(photos, rows=photos.rows[order], is_query=is_query[order]))
+    measured = {figure.what: figure.measured for figure in report.figures}
+    assert measured["house, walks of its queries: tracking"] > 30
+    assert measured["house, walks of its queries: right among them"] > 90
+    assert measured["house, walks on floors left out: tracking"] < 5
 
 
 def test_without_a_folder_the_tower_of_the_test_data_is_measured(
