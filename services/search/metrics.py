@@ -69,7 +69,7 @@ class MeteredSearch:
             buckets=LATENCY_BUCKETS,
         )
         self._matched_photos = counter(
-            "matched_photos", "Photos by result: matched or without_features.", ["result"]
+            "matched_photos", "Photos by outcome: matched or without_features.", ["outcome"]
         )
         self._registry.register(_SnapshotCollector(worker))
 

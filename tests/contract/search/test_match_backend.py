@@ -117,7 +117,7 @@ def test_next_worker_matches_when_one_is_down_and_the_metrics_count_it(
             assert tier.port.match(request).candidates[0] is not None
         metrics = httpx2.get(f"{first.url}/metrics").text
         assert 'placewise_search_matches_total{outcome="answered"} 5.0' in metrics
-        assert 'placewise_search_matched_photos_total{result="without_features"} 5.0' in metrics
+        assert 'placewise_search_matched_photos_total{outcome="without_features"} 5.0' in metrics
         first.stop()
         with pytest.raises(Unavailable) as caught:
             tier.port.match(request)

@@ -24,7 +24,6 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.jobs import Job
 from shared.catalog.tracks import Track, TrackFrame
-from shared.config.settings import Settings
 from shared.evaluation.places.levels import FEATURES
 from shared.evaluation.places.probability import PlaceModel
 from shared.search_api.protocol import SearchRequest, SearchResponse
