@@ -38,12 +38,13 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from lab.benchmarks.report import Report, printed_report
-from lab.datasets.dataset import EvaluationSet
+from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.datasets.ground_truth import find_positives, parse_rule
 from lab.datasets.open_dataset import open_evaluation_set
 from lab.evaluation.query_clusters import cluster_queries
 from lab.evaluation.sequences import (
     FrameResult,
+    SequenceMap,
     evaluate_sequence,
     prepare_map,
     sequence_figures,
@@ -68,6 +69,7 @@ from shared.tracks.motion import MOTION_MODELS
 
 CERTAINTY = 0.95
 LEFT_OUT_GROUPS = 4
+WALK = MOTION_MODELS["walk"]
 Mask = NDArray[np.bool_]
 
 
@@ -311,13 +313,19 @@ def left_out_labels(photos: DescribedPhotos) -> Iterable[Mask]:
 
 def add_walks(report: Report, dataset: EvaluationSet, photos: DescribedPhotos) -> None:
     """Report what tracks claim on floors that the map has, and on floors that it lacks."""
-    frames = [*dataset.database, *dataset.queries]
-    floors = np.array([label_levels(frame.place, True)[-2:][0] for frame in frames])
-    queries, missing = [], []
+    every = [*dataset.database, *dataset.queries]
+    floors = np.array([label_levels(photo.place, True)[-2:][0] for photo in every])
+
+    def open_map(in_map: Mask) -> tuple[EvaluationSet, SequenceMap]:
+        found = replace(dataset, database=tuple(every[n] for n in np.flatnonzero(in_map)))
+        return found, prepare_map(found, photos.rows[in_map], WALK)
+
+    whole, queries, missing = open_map(~photos.is_query), [], []
     for floor in sorted({*floors.tolist()}):
         there = floors == floor
-        queries.append(_follow(dataset, photos, ~photos.is_query, photos.is_query & there))
-        missing += _follow(dataset, photos, ~photos.is_query & ~there, there)
+        queries.append(_follow(*whole, every, photos.rows, photos.is_query & there))
+        without = open_map(~photos.is_query & ~there)
+        missing += _follow(*without, every, photos.rows, there)
     figures, what = sequence_figures(queries), f"{dataset.name}, walks of its queries"
     report.add(f"{what}: tracking", 100 * figures["tracking"], "%")
     right = figures["tracking_precision"]
@@ -328,24 +336,22 @@ def add_walks(report: Report, dataset: EvaluationSet, photos: DescribedPhotos) -
 
 
 def _follow(
-    dataset: EvaluationSet, photos: DescribedPhotos, in_map: Mask, walked: Mask
+    dataset: EvaluationSet,
+    map_: SequenceMap,
+    every: Sequence[DatasetPhoto],
+    rows: NDArray[np.float32],
+    walked: Mask,
 ) -> list[FrameResult]:
-    """Follow the photos of a walk through a map of some of the photos."""
-    every = [*dataset.database, *dataset.queries]
-    database = tuple(every[n] for n in np.flatnonzero(in_map))
+    """Follow the photos of a walk in the order of their names."""
     walk = sorted(np.flatnonzero(walked).tolist(), key=lambda n: every[n].path.name)
     stems = [every[n].path.stem for n in walk]
     numbers = [int("0" + stem[len(stem.rstrip("0123456789")) :]) for stem in stems]
     steps = [max(1, after - before) for before, after in pairwise(numbers)]
     seconds = np.cumsum([0, *steps]).tolist()
-    queries = tuple(
-        replace(every[n], frame=second) for n, second in zip(walk, seconds, strict=True)
-    )
-    positives = tuple(find_positives(parse_rule(dataset.rule), queries, database))
-    walked_set = replace(dataset, database=database, queries=queries, positives=positives)
-    motion = MOTION_MODELS["walk"]
-    map_ = prepare_map(walked_set, photos.rows[in_map], motion)
-    return evaluate_sequence(map_, walked_set, range(len(walk)), photos.rows[walk], motion)[0]
+    frames = [replace(every[n], frame=second) for n, second in zip(walk, seconds, strict=True)]
+    positives = tuple(find_positives(parse_rule(dataset.rule), frames, dataset.database))
+    walked_set = replace(dataset, queries=tuple(frames), positives=positives)
+    return evaluate_sequence(map_, walked_set, range(len(walk)), rows[walk], WALK)[0]
 
 
 def add_judged(report: Report, what: str, judged: Sequence[Judged]) -> None:
