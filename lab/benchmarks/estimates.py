@@ -197,7 +197,7 @@ def describe_set(folder: Path, progress: Progress) -> DescribedPhotos:
         cluster_queries(photos).labels,
         LevelScheme(labels_are_paths=is_path, radii_m=settings.level_radii_m),
         settings.estimate_radius_m,
-        dataset,
+        dataset=dataset,
     )
 
 
