@@ -1,0 +1,72 @@
+"""`placewise bench matches`: what it reports of a set whose photos match."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lab.benchmarks.estimates import DescribedPhotos
+from lab.benchmarks.matches import MatchedPhotos, add_cost, add_peer, compare
+from lab.benchmarks.report import Report
+from shared.evaluation.places.evidence import PhotoLocation
+from shared.evaluation.places.levels import LevelScheme
+from shared.matching.features import LocalFeatures
+from shared.matching.matchers import MutualNearest
+from tests.support.local_features import MODEL, scene_features
+
+PLACES, PER_PLACE = 16, 4
+
+
+def described() -> DescribedPhotos:
+    """Places whose descriptors overlap."""
+    rng = np.random.default_rng(0)
+    rows = np.repeat(rng.normal(size=(PLACES, 16)), PER_PLACE, 0)
+    rows += 0.9 * rng.normal(size=rows.shape)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    numbers = np.arange(len(rows))
+    return DescribedPhotos(
+        "house",
+        rows.astype(np.float32),
+        [PhotoLocation(None, None, f"house/{n // PER_PLACE}") for n in numbers.tolist()],
+        [None] * len(rows),
+        numbers % PER_PLACE == 0,
+        numbers // PER_PLACE,
+        LevelScheme(labels_are_paths=True, radii_m=(25.0,)),
+        25.0,
+    )
+
+
+def features() -> list[LocalFeatures]:
+    """Photos of one place show the same points from other positions."""
+    return [
+        scene_features(number // PER_PLACE, view=0.1 * (number % PER_PLACE), points=40)
+        for number in range(PLACES * PER_PLACE)
+    ]
+
+
+def test_matches_find_the_places_that_descriptors_confuse_at_a_cost_that_is_reported() -> None:
+    matched = MatchedPhotos(features(), MutualNearest.of_model(MODEL))
+    report = Report("matches")
+    compare(report, described(), matched)
+    add_cost(report, "house", matched, seconds=0.64)
+    measured = {figure.what: figure.measured for figure in report.figures}
+    recalls = [
+        measured[f"house, {name} matches: right at the finest level"]
+        for name in ("without", "with")
+    ]
+    assert recalls[1] > recalls[0] + 10
+    assert measured["house: CPU a photo"] == 10
+    assert measured["house: bytes a photo"] == 16 + 40 * 68
+    assert 0 < measured["house: CPU a pair, matching alone"] < measured["house: CPU a pair"]
+
+
+def test_each_pair_is_matched_once_and_the_peer_is_measured_on_the_same_pairs() -> None:
+    matched = MatchedPhotos(features()[:5], MutualNearest.of_model(MODEL))
+    same, other = matched.match(1, [0, 4])
+    assert same is not None
+    assert other is not None
+    assert same > 10 * max(other, 1.0)
+    assert matched.match(0, [1]) == [same]
+    assert len(matched.supports) == 2
+    report = Report("matches")
+    add_peer(report, "house", matched)
+    assert report.figures[0].measured > 0
