@@ -466,6 +466,8 @@ def missing_log_odds(gateway: GatewayContext, query: SimilarityQuery) -> float |
     model = (weights.calibration(found.hits) or PlaceModel()).for_scheme(scheme)
     if not found.hits:
         return None
+    if not scheme.labels_are_paths and found.ranking[0].location.latitude is not None:
+        return None  # it has none for coordinates: spares the second search
     neighbours = search.rank_neighbours(found.hits[0].photo_id)
     radius_m = gateway.settings.estimate_radius_m
     return model.missing_log_odds(found.ranking, neighbours, scheme, radius_m)
