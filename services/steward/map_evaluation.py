@@ -31,6 +31,7 @@ from services.steward.evaluation_search import (
     RankPhoto,
     read_geotagged_photos,
 )
+from shared.catalog.chunks import find_features_model
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map, Matching
@@ -208,7 +209,6 @@ class MapEvaluation:
         matching: Matching,
         on_query: Callable[[], None],
     ) -> None:
-        self.matching = matching
         self.radius_m = radius_m
         self.scheme = scheme
         self.on_query = on_query
@@ -218,6 +218,8 @@ class MapEvaluation:
             self.database = GeotaggedPhotos(database)
             self.queries = read_geotagged_photos(session, *ids, PhotoRole.QUERY)
             version = session.get_one(Map, generation.map_id).version
+            has_features = find_features_model(session, generation.id) is not None
+        self.matching = matching if has_features else Matching.OFF
         self._by_id = {photo.photo_id: photo for photo in self.database.photos}
         self._index_of = {photo.photo_id: i for i, photo in enumerate(self.database.photos)}
         self.search = EvaluationSearch(catalog, search, generation, version, self._by_id)

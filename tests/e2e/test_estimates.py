@@ -81,7 +81,8 @@ def test_an_evaluation_lets_answers_say_whether_the_place_is_in_the_map(
     assert (before["latitude"], before["longitude"]) == (pytest.approx(3), pytest.approx(7))
 
     job = evaluate(server, "streets")
-    assert job["progress"] == {"done": ENOUGH, "total": ENOUGH, "failed": 0}
+    # Each photo is searched, and matched with those that it finds.
+    assert job["progress"] == {"done": 2 * ENOUGH, "total": 2 * ENOUGH, "failed": 0}
     (body,) = got(server.client.get("/api/v1/evaluations", params={"map": "streets"}))[
         "evaluations"
     ]
