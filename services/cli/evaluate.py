@@ -210,6 +210,11 @@ def _recall_rows(figures: Json) -> list[tuple[str, Json]]:
         ("own photos", figures["leave_one_out"]),
         ("without sequence", figures["leave_one_out_without_sequence"]),
     ]
+    if figures["places_with_matches"]:
+        rows += [
+            ("own photos, by matches", figures["leave_one_out_by_matches"]),
+            ("without sequence, by matches", figures["leave_one_out_without_sequence_by_matches"]),
+        ]
     if figures["labelled_queries"]:
         rows.append(("labelled queries", figures["labelled_queries"]))
     return rows

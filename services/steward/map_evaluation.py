@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import filterfalse, islice
 from statistics import median
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -38,6 +38,7 @@ from shared.catalog.maps import Map, Matching
 from shared.catalog.photos import PhotoRole
 from shared.evaluation.places.evidence import (
     EVIDENCE_DEPTH,
+    MATCHED_PHOTOS,
     RankedPhoto,
     are_matched,
     distance_between_m,
@@ -55,6 +56,8 @@ from shared.evaluation.places.samples import (
     attach_matches,
 )
 from shared.search_api.protocol import SearchBackend, SearchHit
+
+Photo = TypeVar("Photo")
 
 RECALL_RANKS = (1, 5, 10)
 
@@ -247,7 +250,7 @@ class MapEvaluation:
             self.radius_m,
             partial(self._rank_own_photo, rank_photo),
         )
-        recalls = self._leave_one_out(sample, own_photos)
+        recalls = self._leave_one_out(sample, own_photos, lambda _, ranked: ranked)
         indices = [self._index_of[photo.photo_id] for photo in sample]
         spread = own_photos.spread(indices)
         labelled = self._evaluate_labelled_queries(rank_photo, own_photos, spread)
@@ -258,8 +261,13 @@ class MapEvaluation:
         )
         model = places.model
         with_matches, uses_matches = self._evaluate_matches(own_photos, samples, to_fit, spread)
-        if with_matches is not None and uses_matches:
-            model = model.model_copy(update={"with_matches": with_matches.model})
+        if with_matches is not None:
+            of_matches = self._leave_one_out(
+                self._draw_to_match(sample), own_photos, self._order_by_matches
+            )
+            recalls |= {f"{name}_by_matches": recall for name, recall in of_matches.items()}
+            if uses_matches:
+                model = model.model_copy(update={"with_matches": with_matches.model})
         figures = {
             "radius_m": self.radius_m,
             **recalls,
@@ -289,10 +297,7 @@ class MapEvaluation:
         """
         if self.matching == Matching.OFF:
             return None, None
-        chosen = sorted({sample.photo for sample in samples})
-        if len(chosen) > MAX_MATCHED_SAMPLE:
-            rng = np.random.default_rng(len(chosen))
-            chosen = sorted(rng.choice(chosen, MAX_MATCHED_SAMPLE, replace=False).tolist())
+        chosen = self._draw_to_match(sorted({sample.photo for sample in samples}))
         matched: list[PlaceSample] = []
         for photo in chosen:
             matched += own_photos.samples([photo], spread, self._match_own_photo)
@@ -308,14 +313,37 @@ class MapEvaluation:
             return places, True
         return places, False if len(photos) >= MIN_PHOTOS_TO_DECIDE else None
 
+    def _draw_to_match(self, photos: Sequence[Photo]) -> list[Photo]:
+        """Draw those of a sample that are matched, always the same."""
+        if len(photos) <= MAX_MATCHED_SAMPLE:
+            return list(photos)
+        rng = np.random.default_rng(len(photos))
+        chosen = rng.choice(len(photos), MAX_MATCHED_SAMPLE, replace=False)
+        return [photos[index] for index in sorted(chosen.tolist())]
+
+    def _order_by_matches(
+        self, query: GeotaggedPhoto, ranked: Iterable[GeotaggedPhoto]
+    ) -> list[GeotaggedPhoto]:
+        """Return the first MATCHED_PHOTOS of a ranking, ordered by their match support."""
+        first = list(islice(ranked, MATCHED_PHOTOS))
+        supports = self.search.match(query.photo_id, [photo.photo_id for photo in first])
+        order = sorted(range(len(first)), key=lambda rank: -(supports[rank] or 0.0))
+        return [first[rank] for rank in order]
+
     def _match_own_photo(self, photo: int, others: Sequence[Any]) -> Sequence[float | None]:
         photos = self.database.photos
         return self.search.match(photos[photo].photo_id, [photos[o].photo_id for o in others])
 
     def _leave_one_out(
-        self, sample: Sequence[GeotaggedPhoto], own_photos: OwnPhotoSampler
+        self,
+        sample: Sequence[GeotaggedPhoto],
+        own_photos: OwnPhotoSampler,
+        order: Callable[[GeotaggedPhoto, Iterable[GeotaggedPhoto]], Iterable[GeotaggedPhoto]],
     ) -> dict[str, Any]:
-        """Return recall with and without the photos of a query's sequence."""
+        """Return recall with and without the photos of a query's sequence.
+
+        `order` returns the photos that a query finds in another order.
+        """
         recall, apart = _OwnPhotoRecall(self.radius_m), _OwnPhotoRecall(self.radius_m)
         photos = self.database.photos
         for query in sample:
@@ -325,9 +353,9 @@ class MapEvaluation:
             ranked = [photos[index] for index in found[0].tolist()]
             at_place = self.database.find_at_place(query.spot, self.radius_m)
             at_place = [photo for photo in at_place if photo.photo_id != query.photo_id]
-            recall.add(query, ranked, at_place)
+            recall.add(query, order(query, ranked), at_place)
             is_apart = partial(filterfalse, query.is_same_sequence)
-            apart.add(query, is_apart(ranked), is_apart(at_place))
+            apart.add(query, order(query, is_apart(ranked)), is_apart(at_place))
         return {
             "leave_one_out": recall.figures(),
             "leave_one_out_without_sequence": apart.figures(),

@@ -53,6 +53,10 @@ def test_a_map_uses_matches_where_they_answer_more(town: Town) -> None:
     without = {a["certainty"]: a for a in figures["places"]["answers"]}[0.95]
     assert at_95["answered"]["mean"] > without["answered"]["mean"] + 0.03
     assert at_95["precision"]["mean"] >= 0.95
+    for kind in ("leave_one_out", "leave_one_out_without_sequence"):
+        by_similarity, by_matches = figures[kind], figures[f"{kind}_by_matches"]
+        assert by_matches["R@10"] == by_similarity["R@10"]
+        assert by_matches["R@1"] > by_similarity["R@1"]
 
 
 def test_matches_that_tell_nothing_are_not_used(town: Town) -> None:
@@ -88,10 +92,11 @@ def publish_clustered(
     """Photos of places at angles that overlap, with the points of their places."""
     rng = np.random.default_rng(0)
     numbers = range(PLACES * PER_PLACE)
-    seen: list[tuple[float, dict[str, Any]]] = [
-        (360 / PLACES * (n // PER_PLACE) + noise_degrees * rng.normal(), at(n // PER_PLACE))
-        for n in numbers
-    ]
+    seen: list[tuple[float, dict[str, Any]]] = []
+    for number in numbers:
+        place, walk = number // PER_PLACE, "abcd"[number % PER_PLACE]
+        angle = 360 / PLACES * place + noise_degrees * rng.normal()
+        seen.append((angle, at(place, filename=f"{walk}{place}.jpg")))
     ids = town.publish(seen)
     if with_features:
         scenes = {
