@@ -215,7 +215,6 @@ class EvaluationSearch:
                 return None
             descriptor, chunk = location
             request = SearchRequest(
-                map_id=self.generation.map_id,
                 generation_id=self.generation.id,
                 object_key=chunk.object_key,
                 row=descriptor.row,

@@ -152,16 +152,23 @@ class ValidatedPhoto:
 
 
 def validate_photo(
-    store: ObjectStore, upload: StoredUpload, max_pixels: int, key_id: UUID | None = None
+    store: ObjectStore,
+    upload: StoredUpload,
+    max_pixels: int,
+    key_id: UUID | None = None,
+    fields: PhotoFields | None = None,
 ) -> ValidatedPhoto:
     """Validate a photo's signature, form fields and header.
+
+    Args:
+        fields: The fields of a photo that was announced; None to read those of the form.
 
     Raises:
         UnsupportedMedia: `unsupported_photo`.
         Unprocessable: `invalid_field`, `undecodable_photo`, `too_many_pixels`.
     """
     media_type = check_photo_signature(upload.first_bytes)
-    fields = read_form_fields(upload.fields)
+    fields = fields or read_form_fields(upload.fields)
     with upload.open(store) as file:
         header = read_photo_header(file, max_pixels)
     return ValidatedPhoto(upload, media_type, header, fields, key_id)

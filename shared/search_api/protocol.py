@@ -66,7 +66,6 @@ class SearchRequest(_Message):
     # Unknown fields of a request are refused: ignoring a filter would give a wrong result.
     model_config = ConfigDict(extra="forbid")
 
-    map_id: UUID
     generation_id: UUID
     object_key: str
     row: int = Field(ge=0)

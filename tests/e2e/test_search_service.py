@@ -59,7 +59,6 @@ def ask(port: HttpSearchClient, home: Path, file_id: str) -> SearchResponse:
         found = find_descriptor(session, generation.id, UUID(file_id))
         assert found is not None
         request = SearchRequest(
-            map_id=map_.id,
             generation_id=generation.id,
             object_key=found[1].object_key,
             row=found[0].row,

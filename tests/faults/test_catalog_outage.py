@@ -134,7 +134,6 @@ class Deployment:
             found = find_descriptor(session, generation.id, session.get_one(Photo, photo_id).id)
             assert found is not None
             return SearchRequest(
-                map_id=map_.id,
                 generation_id=generation.id,
                 object_key=found[1].object_key,
                 row=found[0].row,

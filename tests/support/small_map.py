@@ -137,7 +137,6 @@ class SmallMap:
     ) -> SearchRequest:
         """`photos` are the filter's conditions."""
         return SearchRequest(
-            map_id=self.map_id,
             generation_id=self.generation_id,
             object_key=reference[0],
             row=reference[1],

@@ -52,15 +52,14 @@ from shared.catalog.maps import get_map
 from shared.catalog.photos import PresignedUpload, get_presigned_upload
 from shared.errors import Conflict, NotFound, Unavailable, Unprocessable
 from shared.ids import new_id
-from shared.imaging.photo_header import read_photo_header
 from shared.ingest.photo_metadata import PhotoFields, check_coordinate_pair
 from shared.ingest.store_photo import StoreResult, insert_photo
 from shared.ingest.validation import (
     StoredUpload,
     ValidatedPhoto,
     base_name,
-    check_photo_signature,
     file_too_large_error,
+    validate_photo,
 )
 from shared.storage import ObjectInfo, PresigningStore
 from shared.storage.keys import incoming_key, new_original_key
@@ -241,11 +240,13 @@ def _validate_copy(
             f"The file that was sent has the SHA-256 {received.sha256}, not {upload.sha256}. "
             "Send the announced file again to the same URL, or start a new upload.",
         )
-    media_type = check_photo_signature(received.first_bytes)
-    with store.open(key) as file:
-        header = read_photo_header(file, gateway.settings.max_image_pixels)
-    fields = _parse_photo_fields(upload.photo_fields)
-    return ValidatedPhoto(received, media_type, header, fields, get_caller(request).key_id)
+    return validate_photo(
+        store,
+        received,
+        gateway.settings.max_image_pixels,
+        get_caller(request).key_id,
+        _parse_photo_fields(upload.photo_fields),
+    )
 
 
 def _check_object_size(info: ObjectInfo | None, upload: PresignedUpload) -> None:

@@ -283,7 +283,6 @@ class _MapSearch:
         while True:
             response = self.gateway.search.search(
                 SearchRequest(
-                    map_id=query.map.id,
                     generation_id=query.generation.id,
                     object_key=query.object_key,
                     row=query.row,

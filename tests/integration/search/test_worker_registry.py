@@ -129,7 +129,6 @@ def found(registered: Registered, workplace: Workplace, generation: Generation) 
     with workplace.catalog.read() as session:
         version = session.get_one(Map, workplace.map_id).version
     request = SearchRequest(
-        map_id=workplace.map_id,
         generation_id=generation.id,
         object_key=key,
         row=0,

@@ -17,7 +17,7 @@ from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStat
 from tests.support.servers.handle import wait_until
 
 REQUEST = SearchRequest(
-    map_id=new_id(), generation_id=new_id(), object_key="queries/a.npy", row=0, min_version=0, k=1
+    generation_id=new_id(), object_key="queries/a.npy", row=0, min_version=0, k=1
 )
 RESPONSE = SearchResponse(
     hits=(), certificate="exhaustive", rows_scanned=0, rows_reranked=0, snapshot_version=1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from uuid import UUID
 
 import httpx2
 import pytest
@@ -58,7 +57,6 @@ def holding(shard: str, version: int | None = None) -> SearchStatus:
 
 
 REQUEST = SearchRequest(
-    map_id=UUID(int=1),
     generation_id=GENERATION,
     object_key="queries/a.npy",
     row=0,
