@@ -25,11 +25,11 @@ def read_photo(data: bytes, name: str) -> Image.Image:
         Unprocessable: `photo_not_drawable`.
     """
     try:
-        decoded = decode_photo(data, get_preprocessing("square224"), MAX_PIXELS, working=True)
+        decoded = decode_photo(data, get_preprocessing("square224"), MAX_PIXELS, for_detection=True)
     except PlacewiseError as error:
         raise photo_not_drawable_error(name, error) from error
-    assert decoded.working is not None
-    return Image.fromarray(decoded.working)
+    assert decoded.detection_pixels is not None
+    return Image.fromarray(decoded.detection_pixels)
 
 
 def photo_not_drawable_error(name: str, error: PlacewiseError) -> Unprocessable:

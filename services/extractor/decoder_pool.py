@@ -65,7 +65,7 @@ class DecoderPool:
         preprocessing: Preprocessing,
         *,
         previews: Previews = Previews.NONE,
-        working: bool = False,
+        for_detection: bool = False,
     ) -> list[DecodedPhoto | PlacewiseError]:
         """Decode photos; each result is a decoded photo, or the error that explains the failure.
 
@@ -82,7 +82,7 @@ class DecoderPool:
             preprocessing=preprocessing,
             max_pixels=self._settings.max_image_pixels,
             previews=previews,
-            working=working,
+            for_detection=for_detection,
         )
         outcomes: list[DecodedPhoto | PlacewiseError] = []
         pending: deque[tuple[ProcessFuture[DecodedPhoto], bytes]] = deque()

@@ -114,8 +114,10 @@ def _read_photos(
     photos = _PreparedPhotos(
         lambda pixels: target.extractor.describe(pixels, target.centres, target.projection)
     )
-    working = features is not None and bool(features.missing)
-    decoded, photos.failed = _decode_photos(context, batch, batch.jobs, target, working=working)
+    for_detection = features is not None and bool(features.missing)
+    decoded, photos.failed = _decode_photos(
+        context, batch, batch.jobs, target, for_detection=for_detection
+    )
     # Stored here and not with the chunk, while the model runs the previous batch.
     with batch.timed("thumbnails"):
         for job, photo in decoded:
@@ -133,7 +135,7 @@ def _decode_photos(
     jobs: Sequence[Job],
     target: ResolvedGeneration,
     *,
-    working: bool,
+    for_detection: bool,
 ) -> tuple[list[tuple[Job, DecodedPhoto]], list[tuple[Job, PlacewiseError]]]:
     """Read and decode the photos of some jobs of the batch; return them and the failures.
 
@@ -164,7 +166,7 @@ def _decode_photos(
     previews = PREVIEWS_BY_KIND.get(batch.kind, Previews.NONE)
     with batch.timed("decode"):
         outcomes = context.decoders.decode(
-            read(), target.extractor.preprocessing, previews=previews, working=working
+            read(), target.extractor.preprocessing, previews=previews, for_detection=for_detection
         )
     for job, outcome in zip(present, outcomes, strict=True):
         if isinstance(outcome, PlacewiseError):
@@ -236,7 +238,7 @@ def _read_rows(
     ready = [job for job in batch.jobs if job.photo_id in rows]
     if features and features.missing:
         missing = [job for job in ready if job.id in features.missing]
-        decoded, failed = _decode_photos(context, batch, missing, target, working=True)
+        decoded, failed = _decode_photos(context, batch, missing, target, for_detection=True)
         for job, photo in decoded:
             features.add_photo(job, photo)
         for job, error in failed:

@@ -49,8 +49,8 @@ class BatchFeatures:
     def detect(self) -> None:
         """Detect the features of the photos added."""
         for job_id, photo in self._photos.items():
-            assert photo.working is not None, "it was decoded for its features"
-            features = detect_features(self.detector, photo.working, photo.size)
+            assert photo.detection_pixels is not None, "it was decoded for its features"
+            features = detect_features(self.detector, photo.detection_pixels, photo.size)
             self.encoded[job_id] = features.encode()
         self._photos.clear()
 

@@ -63,7 +63,7 @@ class DecodedPhoto:
     (`shared.imaging.file_formats.needs_preview`)."""
     size: tuple[int, int] = (0, 0)
     """(width, height) of the upright photo."""
-    working: NDArray[np.uint8] | None = None
+    detection_pixels: NDArray[np.uint8] | None = None
     """(height, width, 3) RGB of the upright photo, its longer side at most WORKING_SIDE; None if
     not requested."""
 
@@ -74,9 +74,9 @@ def decode_photo(
     max_pixels: int,
     *,
     previews: Previews = Previews.NONE,
-    working: bool = False,
+    for_detection: bool = False,
 ) -> DecodedPhoto:
-    """Decode and preprocess a photo, and make its upright thumbnail, preview and `working` copy.
+    """Decode and preprocess a photo, and make what else `DecodedPhoto` has of it.
 
     Only the first frame is read. Transparent areas become black; 16-bit samples keep their upper
     eight bits. A JPEG of more than FULL_DECODE_PIXELS is decoded at half its width and height,
@@ -105,7 +105,7 @@ def decode_photo(
             pixels = preprocessing.apply(upright if preprocessing.upright else as_stored)
             thumbnail = _small_jpeg(upright, THUMBNAIL_PIXELS, quality=85)
             preview = _small_jpeg(upright, PREVIEW_PIXELS, quality=80) if with_preview else None
-            small = np.array(_shrink(upright, WORKING_SIDE)) if working else None
+            small = np.array(_shrink(upright, WORKING_SIDE)) if for_detection else None
             return DecodedPhoto(pixels, thumbnail, preview, size, small)
     except UnidentifiedImageError as error:
         raise Unprocessable(

@@ -195,11 +195,11 @@ def test_too_many_pixels_are_an_error_that_names_the_limit() -> None:
 def test_working_copy_is_small_and_upright_and_the_size_is_that_of_the_upright_photo() -> None:
     data = turned_photo(Image.new("RGB", (6000, 8400)), 6, "JPEG")
     assert FULL_DECODE_PIXELS < 6000 * 8400, "it is decoded at half its size"
-    decoded = decode_photo(data, SQUARE, 10**9, working=True)
+    decoded = decode_photo(data, SQUARE, 10**9, for_detection=True)
     assert decoded.size == (6000, 8400)
-    assert decoded.working is not None
-    assert decoded.working.shape == (640, 457, 3)
-    assert decode_photo(photo_bytes(1), SQUARE, PIXELS).working is None
+    assert decoded.detection_pixels is not None
+    assert decoded.detection_pixels.shape == (640, 457, 3)
+    assert decode_photo(photo_bytes(1), SQUARE, PIXELS).detection_pixels is None
 
 
 def private_exif() -> Image.Exif:
