@@ -123,25 +123,35 @@ class Share:
     at_most: float | None = None
 
 
+Folders = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        help="Evaluation sets with coordinates or places. Default: tower in PLACEWISE_TEST_DATA.",
+        exists=True,
+    ),
+]
+
+
+def evaluation_folders(folders: list[Path] | None) -> list[Path]:
+    """Return the folders to measure, by default the tower; Misconfigured (`no_data_set`)."""
+    if folders:
+        return folders
+    if "PLACEWISE_TEST_DATA" not in os.environ:
+        raise Misconfigured(
+            "no_data_set", "Name an evaluation set, or the folder of tower/ in PLACEWISE_TEST_DATA."
+        )
+    return [Path(os.environ["PLACEWISE_TEST_DATA"]) / "tower"]
+
+
 def bench(
-    folders: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            help="Evaluation sets with coordinates or places. Default: tower in "
-            "PLACEWISE_TEST_DATA.",
-            exists=True,
-        ),
-    ] = None,
+    folders: Folders = None,
     splits: Annotated[int, typer.Option(min=0, help="Random splits of each set.")] = 5,
     as_json: JsonOption = False,
 ) -> None:
     """Measure how often place estimates answer, how often they are right, and their calibration."""
-    if not folders and "PLACEWISE_TEST_DATA" not in os.environ:
-        raise Misconfigured(
-            "no_data_set", "Name an evaluation set, or the folder of tower/ in PLACEWISE_TEST_DATA."
-        )
+    measured = evaluation_folders(folders)
     with printed_report(f"estimates at certainty {CERTAINTY}", as_json) as (report, progress):
-        for folder in folders or [Path(os.environ["PLACEWISE_TEST_DATA"]) / "tower"]:
+        for folder in measured:
             measure_set(report, describe_set(folder, progress), splits, progress)
 
 

@@ -13,7 +13,6 @@ of the fundamental matrix. CPU times are those of one thread.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -28,15 +27,16 @@ from PIL import Image, ImageOps
 
 from lab.benchmarks.estimates import (
     DescribedPhotos,
+    Folders,
     Judged,
     add_judged,
     describe_set,
+    evaluation_folders,
     fit_and_judge,
     left_out_labels,
 )
 from lab.benchmarks.report import Report, printed_report
 from services.cli.output import JsonOption, Table
-from shared.errors import Misconfigured
 from shared.evaluation.places.evidence import match_support
 from shared.matching.detectors import Detector, detect_features, load_detector
 from shared.matching.features import WORKING_SIDE, LocalFeatures
@@ -84,23 +84,13 @@ class MatchedPhotos:
 
 
 def bench(
-    folders: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            help="Evaluation sets with coordinates or places. Default: tower in "
-            "PLACEWISE_TEST_DATA.",
-            exists=True,
-        ),
-    ] = None,
+    folders: Folders = None,
     detector: Annotated[str, typer.Option(help="xfeat or aliked-n16.")] = "xfeat",
     lightglue: Annotated[bool, typer.Option(help="Match with LightGlue.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Measure the cost of local features, and what their matches add to place estimates."""
-    if not folders and "PLACEWISE_TEST_DATA" not in os.environ:
-        raise Misconfigured(
-            "no_data_set", "Name an evaluation set, or the folder of tower/ in PLACEWISE_TEST_DATA."
-        )
+    measured = evaluation_folders(folders)
     device = torch.device("cpu")
     loaded = load_detector(detector, device)
     matcher: Matcher = MutualNearest.of_model(loaded.model)
@@ -108,7 +98,7 @@ def bench(
         matcher = LightGlueMatcher(detector, device)
     name = f"{loaded.model}, {'LightGlue' if lightglue else 'mutual nearest'}"
     with printed_report(f"matches of {name}", as_json) as (report, progress):
-        for folder in folders or [Path(os.environ["PLACEWISE_TEST_DATA"]) / "tower"]:
+        for folder in measured:
             photos = describe_set(folder, progress)
             assert photos.dataset is not None
             paths = [p.path for p in (*photos.dataset.database, *photos.dataset.queries)]

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 from uuid import UUID
@@ -25,7 +26,7 @@ from shared.descriptors.extractor import Extractor, choose_device, spec_fingerpr
 from shared.descriptors.inference import PRECISIONS, BatchSizeLimit, Precision, choose_precision
 from shared.descriptors.pca_whitening import PcaProjection, decode_whitening
 from shared.descriptors.vocabulary import ClusterCentres, decode_centres
-from shared.errors import Misconfigured, PlacewiseError, Unavailable
+from shared.errors import PlacewiseError, Unavailable
 from shared.extractor_config.configs import ExtractorConfig
 from shared.matching.detectors import Detector, load_detector
 from shared.storage import ObjectStore
@@ -95,16 +96,22 @@ class ModelRegistry:
             precision = choose_precision(self._settings.precision, config, self._device)
         with self._lock:
             if config.name not in self._extractors:
-                try:
+                with self._report_load(name):
                     self._extractors[config.name] = self._load(config, precision)
-                except PlacewiseError as error:
-                    self._load_errors[name] = error.code
-                    raise
-                else:
-                    self._load_errors.pop(name, None)
-                finally:
-                    self._update_state()
             return self._extractors[config.name].with_precision(precision)
+
+    @contextlib.contextmanager
+    def _report_load(self, name: str) -> Iterator[None]:
+        """Show in `state` whether the model called `name` could be loaded in the block."""
+        try:
+            yield
+        except PlacewiseError as error:
+            self._load_errors[name] = error.code
+            raise
+        else:
+            self._load_errors.pop(name, None)
+        finally:
+            self._update_state()
 
     def _update_state(self) -> None:
         # Replaced as a whole: heartbeats read it without the lock, which a load holds for minutes.
@@ -162,17 +169,8 @@ class ModelRegistry:
         Raises:
             Misconfigured: as `load_detector`.
         """
-        with self._lock:
-            try:
-                detector = load_detector(name, self._device)
-            except Misconfigured as error:
-                self._load_errors[name] = error.code
-                raise
-            else:
-                self._load_errors.pop(name, None)
-            finally:
-                self._update_state()
-            return detector
+        with self._lock, self._report_load(name):
+            return load_detector(name, self._device)
 
     def centres(self, vocabulary: Vocabulary) -> ClusterCentres:
         """Return the vocabulary's centres, verified against the catalog's hash."""

@@ -42,7 +42,8 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import EXTRACTOR_JOBS, FIT_JOBS, MODEL_CHANGE_JOBS, JobKind, WaitingFor
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
-from shared.jobs import InProcessWakeups, Job, Priority, mark_started
+from shared.jobs import InProcessWakeups, Job, Priority
+from shared.jobs.claim import mark_started
 from shared.jobs.runner import JobRunner, job_trace_context
 from shared.jobs.transitions import make_waiting_jobs_claimable
 from shared.storage import ObjectStore

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
@@ -75,27 +76,25 @@ class MeteredSearch:
 
     def search(self, request: SearchRequest) -> SearchResponse:
         """Search and record the metrics of the response."""
-        started = time.perf_counter()
-        try:
-            with span("search", shard=str(self._worker.shard), k=request.k):
-                response = self._worker.search(request)
-        except PlacewiseError as error:
-            self._searches.labels(error.code).inc()
-            raise
-        self._observe(response, time.perf_counter() - started)
+        with (
+            _measured(self._searches, self._seconds),
+            span("search", shard=str(self._worker.shard), k=request.k),
+        ):
+            response = self._worker.search(request)
+        self._rows.inc(response.rows_scanned)
+        self._reranked.inc(response.rows_reranked)
+        self._certificates.labels(response.certificate).inc()
+        if response.max_z is not None:
+            self._deviations.observe(response.max_z)
         return response
 
     def match(self, request: MatchRequest) -> MatchResponse:
         """Match and record the metrics of the response."""
-        started = time.perf_counter()
-        try:
-            with span("match", photos=len(request.candidates)):
-                response = self._worker.match(request)
-        except PlacewiseError as error:
-            self._matches.labels(error.code).inc()
-            raise
-        self._matches.labels("answered").inc()
-        self._match_seconds.observe(time.perf_counter() - started)
+        with (
+            _measured(self._matches, self._match_seconds),
+            span("match", photos=len(request.candidates)),
+        ):
+            response = self._worker.match(request)
         matched = sum(each is not None for each in response.candidates)
         self._matched_photos.labels("matched").inc(matched)
         self._matched_photos.labels("without_features").inc(len(request.candidates) - matched)
@@ -104,18 +103,22 @@ class MeteredSearch:
     def status(self) -> SearchStatus:
         return self._worker.status()
 
-    def _observe(self, response: SearchResponse, seconds: float) -> None:
-        self._searches.labels("answered").inc()
-        self._seconds.observe(seconds)
-        self._rows.inc(response.rows_scanned)
-        self._reranked.inc(response.rows_reranked)
-        self._certificates.labels(response.certificate).inc()
-        if response.max_z is not None:
-            self._deviations.observe(response.max_z)
-
     def render(self) -> bytes:
         """Render the metrics in Prometheus' text format."""
         return generate_latest(self._registry)
+
+
+@contextlib.contextmanager
+def _measured(requests: Counter, seconds: Histogram) -> Iterator[None]:
+    """Count the request of the block by its outcome, and observe its duration if it succeeds."""
+    started = time.perf_counter()
+    try:
+        yield
+    except PlacewiseError as error:
+        requests.labels(error.code).inc()
+        raise
+    requests.labels("answered").inc()
+    seconds.observe(time.perf_counter() - started)
 
 
 class _SnapshotCollector(Collector):

@@ -35,7 +35,6 @@ from shared.search_api.protocol import (
     SearchHit,
     SearchRequest,
 )
-from shared.storage.chunks import features_key
 
 SEQUENCE_PERIOD = timedelta(seconds=60)
 SEQUENCE_NUMBERS = 60
@@ -178,7 +177,7 @@ class EvaluationSearch:
             query = rows.pop(photo_id, None)
             if query is not None and rows:
                 references = [
-                    FeatureReference(object_key=features_key(key), row=row)
+                    FeatureReference(object_key=key, row=row)
                     for key, row in (query, *rows.values())
                 ]
                 request = MatchRequest(query=references[0], candidates=tuple(references[1:]))

@@ -331,8 +331,12 @@ class MapEvaluation:
         return [first[rank] for rank in order]
 
     def _match_own_photo(self, photo: int, others: Sequence[Any]) -> Sequence[float | None]:
-        photos = self.database.photos
-        return self.search.match(photos[photo].photo_id, [photos[o].photo_id for o in others])
+        return self._match(self.database.photos[photo], others)
+
+    def _match(self, query: GeotaggedPhoto, others: Sequence[Any]) -> Sequence[float | None]:
+        """Return the match support of a photo with others, which are numbers in `database`."""
+        ids = [self.database.photos[number].photo_id for number in others]
+        return self.search.match(query.photo_id, ids)
 
     def _leave_one_out(
         self,
@@ -416,12 +420,8 @@ class MapEvaluation:
         neighbours: Sequence[RankedPhoto],
         spread: float,
     ) -> PlaceSample | None:
-        photos = self.database.photos
-
-        def match(others: Sequence[Any]) -> Sequence[float | None]:
-            return self.search.match(query.photo_id, [photos[o].photo_id for o in others])
-
-        ranked = attach_matches([r for r in ranked if r.photo is not None], match)
+        known = [r for r in ranked if r.photo is not None]
+        ranked = attach_matches(known, partial(self._match, query))
         if not are_matched(ranked):
             return None
         levels = candidate_levels(ranked, neighbours, self.scheme, spread, self.radius_m)

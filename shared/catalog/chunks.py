@@ -19,6 +19,7 @@ from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import Job, JobState
 from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole, is_geotagged
 from shared.ids import new_id
+from shared.storage.chunks import features_key
 
 # Up to this number, rows are counted per request, which takes about 10 ms.
 MAX_EXACT_COUNT = 10_000
@@ -162,7 +163,7 @@ def count_features(session: Session, generation_id: UUID, detector: str) -> Feat
 def find_feature_rows(
     session: Session, generation_id: UUID, photo_ids: Sequence[UUID]
 ) -> dict[UUID, tuple[str, int]]:
-    """Return object key and row of the chunk of each of the photos, if the chunk has features."""
+    """Return key and row of the feature file of each of the photos whose chunk has one."""
     located = session.execute(
         sa.select(Descriptor.photo_id, Chunk.object_key, Descriptor.row)
         .join(Chunk, Chunk.id == Descriptor.chunk_id)
@@ -172,7 +173,7 @@ def find_feature_rows(
             Chunk.features_model.is_not(None),
         )
     )
-    return {photo_id: (object_key, row) for photo_id, object_key, row in located}
+    return {photo_id: (features_key(object_key), row) for photo_id, object_key, row in located}
 
 
 def list_live_chunks(session: Session, generation_id: UUID) -> list[Chunk]:

@@ -5,9 +5,6 @@ makes a worker look at the table sooner.
 """
 
 from shared.catalog.jobs import Job, JobKind, JobState, Priority
-from shared.jobs.claim import claim_jobs, mark_started
-from shared.jobs.leases import extend_lease, maintain_lease
-from shared.jobs.runner import reclaim_expired_leases
 from shared.jobs.wakeups import InProcessWakeups, Wakeups
 
 __all__ = [
@@ -17,9 +14,4 @@ __all__ = [
     "JobState",
     "Priority",
     "Wakeups",
-    "claim_jobs",
-    "extend_lease",
-    "maintain_lease",
-    "mark_started",
-    "reclaim_expired_leases",
 ]

@@ -106,10 +106,10 @@ def test_an_evaluation_lets_answers_say_whether_the_place_is_in_the_map(
         assert (estimate["radius_m"], estimate["place"]) == (25, None)
         assert estimate["confidence"] == estimate["levels"][0]["probability"]
     outside = [photo_bytes(next(fresh)) for _ in range(20)]
-    strangers = [ask(server, "streets", photo)["estimate"] for photo in outside]
+    estimates_outside = [ask(server, "streets", photo)["estimate"] for photo in outside]
     refused = [
         (photo, estimate)
-        for photo, estimate in zip(outside, strangers, strict=True)
+        for photo, estimate in zip(outside, estimates_outside, strict=True)
         if estimate["in_map"] is False
     ]
     assert len(refused) >= 14, "about one in twenty is accepted"
@@ -124,7 +124,8 @@ def test_an_evaluation_lets_answers_say_whether_the_place_is_in_the_map(
         "searches"
     ]
     assert [(search["in_map"], search["has_place"]) for search in history][::-1] == [
-        (estimate["in_map"], estimate["has_place"]) for estimate in [before, *copies, *strangers]
+        (estimate["in_map"], estimate["has_place"])
+        for estimate in [before, *copies, *estimates_outside]
     ]
 
 
@@ -153,8 +154,10 @@ def test_an_estimate_uses_the_photos_with_a_place_and_counts_the_others(
         assert [m["match_probability"] is None for m in answer["similar_images"]] == [
             m["latitude"] is None for m in answer["similar_images"]
         ]
-    strangers = [ask(server, "mixed", photo_bytes(next(fresh)))["estimate"] for _ in range(20)]
-    assert sum(estimate["in_map"] is False for estimate in strangers) >= 14
+    estimates_outside = [
+        ask(server, "mixed", photo_bytes(next(fresh)))["estimate"] for _ in range(20)
+    ]
+    assert sum(estimate["in_map"] is False for estimate in estimates_outside) >= 14
 
 
 def test_a_filter_that_nothing_passes_gives_no_place_and_says_so(

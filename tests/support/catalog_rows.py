@@ -24,7 +24,8 @@ from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.models import get_or_create_model
 from shared.catalog.photos import Photo, get_photo, mark_photo_deleted
 from shared.ids import new_id
-from shared.jobs import Job, JobKind, JobState, Priority, claim_jobs
+from shared.jobs import Job, JobKind, JobState, Priority
+from shared.jobs.claim import claim_jobs
 from shared.jobs.transitions import cancel_job
 from shared.storage import ObjectStore
 from shared.storage.chunks import Rows, StoredRows, read_chunk, write_chunk

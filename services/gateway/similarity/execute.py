@@ -388,10 +388,7 @@ def _estimate(
     """Return the place estimate, and the probabilities that photos show the query's place."""
     query, settings = search.query, search.gateway.settings
     found, whole_map = rankings.found, rankings.whole_map
-    scheme = LevelScheme(
-        labels_are_paths=query.map.place_labels_are_paths, radii_m=settings.level_radii_m
-    )
-    model = (weights.calibration(found.hits) or PlaceModel()).for_scheme(scheme)
+    model, scheme = _place_model(search, weights, found.hits)
     certainty = search_params.certainty or settings.certainty
     neighbours = search.rank_neighbours(whole_map.hits[0].photo_id) if whole_map.hits else ()
     places = model.estimate(
@@ -412,6 +409,17 @@ def _estimate(
         return estimate, {}
     best = (hit.photo_id for hit in rankings.located.hits)
     return estimate, dict(zip(best, places.match_probabilities, strict=True))
+
+
+def _place_model(
+    search: _MapSearch, weights: _RankingWeights, hits: Sequence[SearchHit]
+) -> tuple[PlaceModel, LevelScheme]:
+    """Return the model of the map's estimates for the ranking of these hits, and its levels."""
+    scheme = LevelScheme(
+        labels_are_paths=search.query.map.place_labels_are_paths,
+        radii_m=search.gateway.settings.level_radii_m,
+    )
+    return (weights.calibration(hits) or PlaceModel()).for_scheme(scheme), scheme
 
 
 def _make_history(
@@ -457,12 +465,9 @@ def missing_log_odds(gateway: GatewayContext, query: SimilarityQuery) -> float |
     if query.generation.calibration is None:
         return None
     weights = select_ranking_weights(query.generation, True)
-    scheme = LevelScheme(
-        labels_are_paths=query.map.place_labels_are_paths, radii_m=gateway.settings.level_radii_m
-    )
     search = _MapSearch(gateway, query, Mode.AUTO, weights.values)
     found = search.find(WITH_PLACE, EVIDENCE_DEPTH)
-    model = (weights.calibration(found.hits) or PlaceModel()).for_scheme(scheme)
+    model, scheme = _place_model(search, weights, found.hits)
     if not found.hits:
         return None
     if not scheme.labels_are_paths and found.ranking[0].location.latitude is not None:

@@ -23,7 +23,6 @@ from shared.search_api.protocol import (
     PointPair,
     SearchHit,
 )
-from shared.storage.chunks import features_key
 
 log = logging.getLogger(__name__)
 
@@ -101,9 +100,7 @@ def match_photos(
     """
     with gateway.catalog.read() as session:
         rows = find_feature_rows(session, generation.id, photo_ids)
-    candidates = tuple(
-        FeatureReference(object_key=features_key(key), row=row) for key, row in rows.values()
-    )
+    candidates = tuple(FeatureReference(object_key=key, row=row) for key, row in rows.values())
     found = MatchResponse(candidates=(), reason="None of the photos has local features yet.")
     if candidates:
         request = MatchRequest(query=query, candidates=candidates, with_pairs=with_pairs)

@@ -29,7 +29,8 @@ from shared.catalog.photos import Photo
 from shared.catalog.tracks import RETENTION_DAYS, Track, delete_tracks
 from shared.catalog.webhooks import Delivery
 from shared.config.settings import Settings
-from shared.jobs import Wakeups, reclaim_expired_leases
+from shared.jobs import Wakeups
+from shared.jobs.runner import reclaim_expired_leases
 from shared.jobs.wakeups import WakeupQueue
 
 log = logging.getLogger(__name__)

@@ -7,11 +7,9 @@ from uuid import UUID
 
 from shared.catalog.database.session import Catalog
 from shared.errors import Unprocessable
-from shared.jobs import (
-    Job,
-    reclaim_expired_leases,
-)
+from shared.jobs import Job
 from shared.jobs.leases import lock_leased_jobs
+from shared.jobs.runner import reclaim_expired_leases
 from shared.jobs.transitions import (
     succeed_job,
 )

@@ -15,12 +15,8 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.generations import GenerationState
 from shared.catalog.jobs import SINGLE_CLAIM_JOBS, Priority, WaitingFor, get_job, list_jobs
 from shared.errors import NotFound
-from shared.jobs import (
-    Job,
-    JobKind,
-    JobState,
-    claim_jobs,
-)
+from shared.jobs import Job, JobKind, JobState
+from shared.jobs.claim import claim_jobs
 from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.model_changes import (
     wake_vocabulary_waiters,

@@ -19,18 +19,10 @@ from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.ids import new_id
-from shared.jobs import (
-    Job,
-    JobKind,
-    JobState,
-    claim_jobs,
-    extend_lease,
-    maintain_lease,
-    mark_started,
-    reclaim_expired_leases,
-)
-from shared.jobs.leases import lock_leased_jobs
-from shared.jobs.runner import MAX_ATTEMPTS
+from shared.jobs import Job, JobKind, JobState
+from shared.jobs.claim import claim_jobs, mark_started
+from shared.jobs.leases import extend_lease, lock_leased_jobs, maintain_lease
+from shared.jobs.runner import MAX_ATTEMPTS, reclaim_expired_leases
 from shared.jobs.transitions import (
     requeue_job,
 )

@@ -12,8 +12,13 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import Job, JobKind, JobState
 from shared.config.settings import Settings
 from shared.errors import Unavailable, Unprocessable
-from shared.jobs import reclaim_expired_leases
-from shared.jobs.runner import MAX_ATTEMPTS, JobInterrupted, JobRunner, StepOutcome
+from shared.jobs.runner import (
+    MAX_ATTEMPTS,
+    JobInterrupted,
+    JobRunner,
+    StepOutcome,
+    reclaim_expired_leases,
+)
 from tests.support.catalog_rows import add_job, add_map, failure_code, read_job, take
 
 KINDS = (JobKind.INDEX, JobKind.DESCRIBE, JobKind.EVALUATE)

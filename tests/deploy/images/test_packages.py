@@ -11,6 +11,7 @@ import pytest
 
 from tests.deploy.composition import ROOT
 from tests.deploy.images.conftest import BuildImage
+from tests.deploy.images.image import Image
 
 # kombu imports it when it first connects.
 BROKER = "kombu.transport.redis"
@@ -55,15 +56,7 @@ def test_an_image_holds_what_its_service_and_the_command_import(
     service: str, image: BuildImage, tmp_path: Path
 ) -> None:
     command = [] if service == "flower" else COMMAND  # it runs Celery's
-    done = subprocess.run(
-        [image(service).python, "-c", IMPORT, *MODULES[service], *command],
-        cwd=tmp_path,
-        env=image(service).environment(tmp_path),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-1500:]
+    run_python(image(service), tmp_path, IMPORT, *MODULES[service], *command)
 
 
 def test_only_the_images_that_describe_photos_hold_torch(image: BuildImage) -> None:
@@ -77,16 +70,21 @@ def test_images_that_describe_photos_load_xfeat_and_nothing_that_its_package_req
 ) -> None:
     required = {"gdown", "matplotlib", "opencv-python", "opencv-python-headless"}
     assert not image(service).packages() & required
+    assert run_python(image(service), tmp_path, LOAD_XFEAT).startswith("xfeat@")
+
+
+def run_python(image: Image, home: Path, *code: str) -> str:
+    """What the program writes, run with these arguments in the environment of an image."""
     done = subprocess.run(
-        [image(service).python, "-c", LOAD_XFEAT],
-        cwd=tmp_path,
-        env=image(service).environment(tmp_path),
+        [image.python, "-c", *code],
+        cwd=home,
+        env=image.environment(home),
         capture_output=True,
         text=True,
         check=False,
     )
     assert done.returncode == 0, done.stderr[-1500:]
-    assert done.stdout.startswith("xfeat@")
+    return done.stdout
 
 
 def test_no_image_holds_a_tool_of_the_developers(image: BuildImage) -> None:

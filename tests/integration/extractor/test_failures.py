@@ -24,7 +24,8 @@ from shared.catalog.photos import Photo, mark_photo_deleted
 from shared.descriptors.backbones.synthetic import TinyBackbone
 from shared.descriptors.extractor import Extractor
 from shared.imaging.preprocessing import Pixels
-from shared.jobs import Job, JobState, claim_jobs
+from shared.jobs import Job, JobState
+from shared.jobs.claim import claim_jobs
 from shared.jobs.runner import MAX_ATTEMPTS
 from shared.jobs.transitions import requeue_job_as_new
 from shared.storage import FolderStore

@@ -16,8 +16,9 @@ from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map, Matching
 from shared.descriptors.extractor import Extractor
-from shared.jobs import JobKind, JobState, reclaim_expired_leases
+from shared.jobs import JobKind, JobState
 from shared.jobs.model_changes import start_reindex
+from shared.jobs.runner import reclaim_expired_leases
 from shared.matching.features import LocalFeatures
 from shared.matching.matchers import MutualNearest
 from shared.matching.verification import verify_matches

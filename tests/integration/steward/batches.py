@@ -12,7 +12,8 @@ from sqlalchemy import select
 from services.steward.batches.worker import BatchWorker
 from shared.catalog.photos import Photo
 from shared.config.settings import Settings
-from shared.jobs import InProcessWakeups, reclaim_expired_leases
+from shared.jobs import InProcessWakeups
+from shared.jobs.runner import reclaim_expired_leases
 from shared.storage.keys import TRASH
 from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import end_pauses, expire_lease

@@ -11,7 +11,8 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Evaluation
 from shared.catalog.jobs import get_job
 from shared.catalog.maps import Search, get_map
-from shared.jobs import JobState, progress, reclaim_expired_leases
+from shared.jobs import JobState, progress
+from shared.jobs.runner import reclaim_expired_leases
 from shared.jobs.transitions import cancel_job, retry_job
 from shared.storage import read_retries
 from tests.integration.in_process_api import Service

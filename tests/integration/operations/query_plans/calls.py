@@ -28,8 +28,9 @@ from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD
 from shared.errors import PlacewiseError
 from shared.ids import new_id
-from shared.jobs import InProcessWakeups, Job, JobState, claim_jobs, extend_lease, mark_started
-from shared.jobs.leases import lock_leased_jobs
+from shared.jobs import InProcessWakeups, Job, JobState
+from shared.jobs.claim import claim_jobs, mark_started
+from shared.jobs.leases import extend_lease, lock_leased_jobs
 from shared.jobs.transitions import requeue_job
 from shared.search_api.protocol import (
     MatchRequest,
