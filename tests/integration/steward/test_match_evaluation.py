@@ -41,7 +41,6 @@ def model(town: Town) -> PlaceModel:
 
 
 def test_a_map_uses_matches_where_they_answer_more(town: Town) -> None:
-    """Few photos of a place are among the first, but those that are show its points."""
     publish_clustered(town, noise_degrees=8.0)
     figures = town.figures()
     assert figures["uses_matches"] is True
@@ -60,7 +59,6 @@ def test_a_map_uses_matches_where_they_answer_more(town: Town) -> None:
 
 
 def test_matches_that_tell_nothing_are_not_used(town: Town) -> None:
-    """All photos show the same points."""
     publish_clustered(town, noise_degrees=8.0, one_scene=True)
     figures = town.figures()
     assert figures["uses_matches"] is False
