@@ -17,6 +17,8 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import pytest
+
 from tests.deploy.composition import Json, seconds
 from tests.deploy.images.image import Image
 from tests.support.servers.daemon import free_ports
@@ -117,11 +119,18 @@ class Machine:
         return folder
 
     def stop(self, service: str) -> int:
-        """The stop signal; the exit code. subprocess.TimeoutExpired after the grace period."""
+        """The stop signal; the exit code. What its threads do is in the log if it does not end."""
         of = self._services[service]
-        process = self._running.pop(service)
+        process = self._running[service]
         process.send_signal(signal.Signals[of.get("stop_signal", "SIGTERM")])
-        return process.wait(timeout=seconds(of["stop_grace_period"]))
+        try:
+            process.wait(timeout=seconds(of["stop_grace_period"]))
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGABRT)
+            process.wait(timeout=LOOK_SECONDS * 10)
+            pytest.fail(f"{service} does not end: {self.log(service)}")
+        del self._running[service]
+        return process.returncode
 
     def send_signal(self, service: str, sig: signal.Signals) -> None:
         self._running[service].send_signal(sig)
@@ -138,7 +147,7 @@ class Machine:
             assert process.poll() is None, f"{service} ended: {self.log(service)}"
 
     def log(self, service: str) -> str:
-        return self._log(service).read_text(errors="replace")[-4000:]
+        return self._log(service).read_text(errors="replace")[-8000:]
 
     def close(self) -> None:
         for process in self._running.values():
@@ -170,7 +179,7 @@ class Machine:
                 read[port] = str(self._ports[service])
         if "METRICS_PORT" in read:
             read["METRICS_PORT"] = "0"  # of all of them on one machine
-        return {**base, **read}
+        return {**base, **read, "PYTHONFAULTHANDLER": "1"}  # SIGABRT writes the stacks
 
     def _log(self, service: str) -> Path:
         return self.root / f"{service}.log"
