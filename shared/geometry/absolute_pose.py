@@ -1,0 +1,198 @@
+"""Absolute pose: where a camera is from the points that it sees.
+
+poselib finds the pose that most pairs agree with. It neither refines a focal length nor returns a
+covariance, so the last steps are done here, in NumPy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from shared.geometry.cameras import MAX_FOCAL_LENGTH, MIN_FOCAL_LENGTH, Camera, Floats
+from shared.geometry.frames import cross_matrices, rotation_of_vector
+from shared.matching.features import WORKING_SIDE
+
+MIN_PAIRS = 6
+MAX_ERROR_PIXELS = 5.0
+"""at WORKING_SIDE, of an inlier"""
+LOSS_SCALE_PIXELS = 1.0
+RANSAC = {"max_reproj_error": MAX_ERROR_PIXELS, "min_iterations": 200, "max_iterations": 5000}
+FOCAL_STARTS = (0.55, 0.7, 0.85, 1.05, 1.4, 2.0)
+"""Focal lengths in longer sides that are tried if none is known"""
+ITERATIONS = 25
+UNKNOWN_FOCAL_SIGMA = 10.0
+"""ln: no knowledge at all"""
+
+
+@dataclass(frozen=True, slots=True)
+class AbsolutePose:
+    """The pose of a camera with its uncertainty."""
+
+    rotation: Floats
+    """(3, 3) from the points' frame to the camera's axes"""
+    position: Floats
+    """(3,) of the camera's centre"""
+    camera: Camera
+    covariance: Floats
+    """(6, 6) of the centre, and of a turn of the camera in the points' frame (radians)"""
+    focal_sigma: float
+    """standard deviation of ln(focal length)"""
+    is_inlier: NDArray[np.bool_]
+    """(m,)"""
+    error_pixels: float
+    """root mean square of the inliers' distances, at WORKING_SIDE"""
+
+
+def estimate_absolute_pose(
+    pixels: Floats,
+    points: Floats,
+    camera: Camera,
+    focal_sigma: float | None,
+    covariances: Floats | None = None,
+) -> AbsolutePose | None:
+    """Return the pose that most pairs agree with; None if there is none.
+
+    Args:
+        pixels: (m, 2) in the photo.
+        points: (m, 3) the point that each pixel may be.
+        camera: of the photo. Its focal length is ignored if `focal_sigma` is None.
+        focal_sigma: relative standard deviation of the focal length; None if it is unknown.
+        covariances: (m, 3, 3) of the points, for keypoints of one pixel at WORKING_SIDE.
+    """
+    if len(pixels) < MIN_PAIRS:
+        return None
+    unit = max(camera.width, camera.height) / WORKING_SIDE
+    options = {**RANSAC, "max_reproj_error": MAX_ERROR_PIXELS * unit}
+    starts = [camera.focal_length] if focal_sigma is not None else FOCAL_STARTS
+    best: _Fit | None = None
+    for start in starts:
+        tried = camera.with_focal_length(start)
+        found, info = poselib.estimate_absolute_pose(
+            pixels, points, tried.as_poselib(), options, {}
+        )
+        if info["num_inliers"] < MIN_PAIRS:
+            continue
+        rotation = np.array(found.R)
+        fit = _Fit(pixels, points, covariances, tried, rotation, -rotation.T @ np.array(found.t))
+        # The first refinement tells which start is best; the second one needs its inliers.
+        fit.refine(focal_sigma)
+        if best is None or fit.cost < best.cost:
+            best = fit
+    if best is None or best.is_inlier.sum() < MIN_PAIRS:
+        return None
+    return best.refine(focal_sigma)
+
+
+class _Fit:
+    """A pose that is refined."""
+
+    def __init__(
+        self,
+        pixels: Floats,
+        points: Floats,
+        covariances: Floats | None,
+        camera: Camera,
+        rotation: Floats,
+        position: Floats,
+    ) -> None:
+        self.pixels, self.points, self.covariances = pixels, points, covariances
+        self.unit = max(camera.width, camera.height) / WORKING_SIDE
+        self.camera, self.rotation, self.position = camera, rotation, position
+        self.start = camera
+        self._measure()
+
+    def _measure(self) -> None:
+        """Compute errors, cost and inliers of the pose."""
+        offsets = self.points - self.position
+        self.seen = offsets @ self.rotation.T
+        self.offsets = offsets
+        in_front = self.seen[:, 2] > 0
+        self.seen[~in_front, 2] = np.inf
+        self.errors = (self.pixels - self.camera.project(self.seen)) / self.unit
+        squares = np.where(in_front, np.sum(self.errors**2, axis=1), np.inf)
+        self.cost = float(np.minimum(squares, MAX_ERROR_PIXELS**2).sum())
+        self.is_inlier: NDArray[np.bool_] = squares < MAX_ERROR_PIXELS**2
+
+    def refine(self, focal_sigma: float | None) -> AbsolutePose:
+        """Refine by Gauss-Newton steps that are weighted as Cauchy's loss does (Triggs, 1999).
+
+        The covariance is that of the inliers' Jacobian, scaled by the variance of their errors.
+        """
+        prior = (UNKNOWN_FOCAL_SIGMA if focal_sigma is None else max(focal_sigma, 1e-6)) ** -2
+        damping = 1e-3
+        for _ in range(ITERATIONS):
+            rows, errors, weights = self._linearise()
+            weighted = rows * weights[:, None, None]
+            normal = np.einsum("mik,mil->kl", weighted, rows)
+            gradient = np.einsum("mik,mi->k", weighted, errors)
+            normal[6, 6] += prior
+            gradient[6] -= prior * np.log(self.camera.focal_pixels / self.start.focal_pixels)
+            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+            before = self.rotation, self.position, self.camera, self.cost
+            self.position = self.position + step[:3]
+            self.rotation = self.rotation @ rotation_of_vector(-step[3:6])
+            focal = self.camera.focal_length * float(np.exp(np.clip(step[6], -0.3, 0.3)))
+            self.camera = self.camera.with_focal_length(
+                float(np.clip(focal, MIN_FOCAL_LENGTH, MAX_FOCAL_LENGTH))
+            )
+            self._measure()
+            if self.cost > before[3] * (1 + 1e-9):
+                self.rotation, self.position, self.camera, _ = before
+                self._measure()
+                damping *= 10
+                if damping > 1e3:
+                    break
+                continue
+            damping = max(damping / 10, 1e-9)
+            if before[3] - self.cost < 1e-6 * self.cost:
+                break
+        rows, errors, _ = self._linearise()
+        count = len(errors)
+        variance = float(np.sum(errors**2)) / max(1, 2 * count - 7)
+        normal = np.einsum("mik,mil->kl", rows, rows) / max(variance, 1e-6)
+        normal[6, 6] += prior
+        covariance = np.linalg.pinv(normal, hermitian=True)
+        return AbsolutePose(
+            self.rotation,
+            self.position,
+            self.camera,
+            covariance[:6, :6],
+            float(np.sqrt(covariance[6, 6])),
+            self.is_inlier,
+            float(np.sqrt(np.mean(self.errors[self.is_inlier] ** 2) * 2)),
+        )
+
+    def _linearise(self) -> tuple[Floats, Floats, Floats]:
+        """Return Jacobian (k, 2, 7), errors (k, 2) and weights (k,) of the inliers.
+
+        In units of their standard deviations, if keypoints have one pixel at WORKING_SIDE.
+        """
+        seen, offsets = self.seen[self.is_inlier], self.offsets[self.is_inlier]
+        errors = self.errors[self.is_inlier]
+        plane = seen[:, :2] / seen[:, 2:]
+        square = np.sum(plane**2, axis=1)
+        focal, radial = self.camera.focal_pixels / self.unit, self.camera.radial
+        of_plane = focal * (
+            (1 + radial * square)[:, None, None] * np.eye(2)
+            + 2 * radial * plane[:, :, None] * plane[:, None, :]
+        )
+        of_seen = np.zeros((len(seen), 2, 3))
+        of_seen[:, 0, 0] = of_seen[:, 1, 1] = 1
+        of_seen[:, :, 2] = -plane
+        of_point = of_plane @ of_seen / seen[:, 2, None, None] @ self.rotation
+        rows = np.empty((len(seen), 2, 7))
+        rows[:, :, :3] = -of_point
+        # A turn t of the camera moves what it sees by -t x offset.
+        rows[:, :, 3:6] = of_point @ cross_matrices(offsets)
+        rows[:, :, 6] = focal * (1 + radial * square)[:, None] * plane
+        if self.covariances is not None:
+            of_pixel = of_point @ self.covariances[self.is_inlier] @ of_point.transpose(0, 2, 1)
+            whitening = np.linalg.inv(np.linalg.cholesky(of_pixel + np.eye(2)))
+            rows = whitening @ rows
+            errors = np.einsum("mij,mj->mi", whitening, errors)
+        weights = 1 / (1 + np.sum(errors**2, axis=1) / LOSS_SCALE_PIXELS**2)
+        return rows, errors, weights

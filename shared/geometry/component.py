@@ -1,0 +1,174 @@
+"""A component of a model: what localising a photo reads of it, as one object of the store."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+from uuid import UUID
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.geometry.cameras import Camera, Floats
+
+NO_POINT = -1
+UNREADABLE = (OSError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
+"""What a damaged zip file raises"""
+ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "photo_ids": ("u1", (16,)),
+    "rotations": ("f8", (4,)),
+    "translations": ("f8", (3,)),
+    "camera_numbers": ("i4", ()),
+    "keypoints": ("i4", ()),
+    "point_numbers": ("i4", ()),
+    "cameras": ("f8", (4,)),
+    "points": ("f8", (3,)),
+    "covariances": ("f4", (3, 3)),
+    "observations": ("i4", ()),
+}
+"""Name -> dtype and shape of a row; `keypoints` are the numbers of a photo's rows in the next."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Component:
+    """Photos that were reconstructed together, in a frame of their own: axes, origin and scale."""
+
+    photo_ids: tuple[UUID, ...]
+    rotations: Floats
+    """(n, 4) unit quaternions w, x, y, z: from the frame to the camera's axes"""
+    translations: Floats
+    """(n, 3): a point X of the frame is rotation @ X + translation in the camera's axes"""
+    camera_numbers: NDArray[np.int32]
+    """(n,)"""
+    point_numbers: tuple[NDArray[np.int32], ...]
+    """for each photo (keypoints,): the point that each of its local features is, or NO_POINT"""
+    cameras: tuple[Camera, ...]
+    points: Floats
+    """(p, 3)"""
+    covariances: NDArray[np.float32]
+    """(p, 3, 3) of the points, if keypoints have a standard deviation of a pixel at WORKING_SIDE"""
+    observations: NDArray[np.int32]
+    """(p,) photos that see the point"""
+
+    def rotation(self, photo: int) -> Floats:
+        """Return the (3, 3) rotation from the frame to the axes of a photo's camera."""
+        return rotation_matrix(self.rotations[photo])
+
+    def centres(self) -> Floats:
+        """Return the (n, 3) positions of the cameras."""
+        return np.array(
+            [-self.rotation(i).T @ self.translations[i] for i in range(len(self.photo_ids))]
+        ).reshape(-1, 3)
+
+    def encode(self) -> bytes:
+        """Encode as a compressed npz of the arrays in ARRAYS."""
+        buffer = io.BytesIO()
+        arrays: dict[str, Any] = {
+            "photo_ids": np.array([list(i.bytes) for i in self.photo_ids]).reshape(-1, 16),
+            "rotations": self.rotations,
+            "translations": self.translations,
+            "camera_numbers": self.camera_numbers,
+            "keypoints": [len(numbers) for numbers in self.point_numbers],
+            "point_numbers": np.concatenate([*self.point_numbers, np.empty(0, np.int32)]),
+            "cameras": np.array(
+                [[c.width, c.height, c.focal_pixels, c.radial] for c in self.cameras]
+            ).reshape(-1, 4),
+            "points": self.points,
+            "covariances": self.covariances,
+            "observations": self.observations,
+        }
+        stored: dict[str, Any] = {
+            name: np.asarray(arrays[name], ARRAYS[name][0]) for name in ARRAYS
+        }
+        np.savez_compressed(buffer, **stored)
+        return buffer.getvalue()
+
+    @classmethod
+    def decode(cls, data: bytes) -> Self:
+        """Decode the result of `encode`; ValueError if it is damaged."""
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as file:
+                arrays = {name: file[name] for name in ARRAYS}
+        except (*UNREADABLE, ValueError) as error:
+            raise ValueError(f"no component of a model: {error}") from error
+        for name, (dtype, shape) in ARRAYS.items():
+            found = arrays[name]
+            if found.dtype != dtype or found.shape[1:] != shape or not found.ndim:
+                raise ValueError(f"{name} are {found.dtype} of shape {found.shape}")
+            if not np.isfinite(found).all():
+                raise ValueError(f"{name} are not finite")
+        _check(arrays)
+        stops = np.cumsum(arrays["keypoints"])[:-1]
+        return cls(
+            tuple(UUID(bytes=row.tobytes()) for row in arrays["photo_ids"]),
+            arrays["rotations"],
+            arrays["translations"],
+            arrays["camera_numbers"],
+            tuple(np.split(arrays["point_numbers"], stops)) if len(arrays["keypoints"]) else (),
+            tuple(Camera(int(w), int(h), f, k) for w, h, f, k in arrays["cameras"].tolist()),
+            arrays["points"],
+            arrays["covariances"],
+            arrays["observations"],
+        )
+
+
+def _check(arrays: dict[str, NDArray[Any]]) -> None:
+    photos, points = len(arrays["photo_ids"]), len(arrays["points"])
+    for name in ("rotations", "translations", "camera_numbers", "keypoints"):
+        if len(arrays[name]) != photos:
+            raise ValueError(f"{len(arrays[name])} {name} for {photos} photos")
+    for name in ("covariances", "observations"):
+        if len(arrays[name]) != points:
+            raise ValueError(f"{len(arrays[name])} {name} for {points} points")
+    counts, numbers = arrays["keypoints"], arrays["point_numbers"]
+    if (counts < 0).any() or counts.sum() != len(numbers):
+        raise ValueError(f"{counts.sum()} keypoints with {len(numbers)} point numbers")
+    if len(numbers) and not NO_POINT <= numbers.min() <= numbers.max() < points:
+        raise ValueError("a keypoint has the number of a point that is not there")
+    cameras = arrays["camera_numbers"]
+    if photos and not 0 <= cameras.min() <= cameras.max() < len(arrays["cameras"]):
+        raise ValueError("a photo has the number of a camera that is not there")
+    if (arrays["cameras"][:, :3] <= 0).any():
+        raise ValueError("a camera has no size or focal length")
+    if photos and np.abs(np.linalg.norm(arrays["rotations"], axis=1) - 1).max() > 1e-6:
+        raise ValueError("a rotation is no unit quaternion")
+
+
+def rotation_matrix(quaternion: Floats | Sequence[float]) -> Floats:
+    """Return the (3, 3) matrix of a unit quaternion w, x, y, z."""
+    w, x, y, z = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_of(rotation: Floats) -> Floats:
+    """Return the (4,) unit quaternion w, x, y, z, w >= 0, of a (3, 3) rotation.
+
+    It is the eigenvector of Bar-Itzhack's symmetric matrix (J. Guidance 23(6), 2000), which no
+    rotation makes singular.
+    """
+    m = rotation
+    k = np.array(
+        [
+            [m[0, 0] + m[1, 1] + m[2, 2], 0.0, 0.0, 0.0],
+            [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], 0.0, 0.0],
+            [m[0, 2] - m[2, 0], m[1, 0] + m[0, 1], m[1, 1] - m[0, 0] - m[2, 2], 0.0],
+            [
+                m[1, 0] - m[0, 1],
+                m[2, 0] + m[0, 2],
+                m[2, 1] + m[1, 2],
+                m[2, 2] - m[0, 0] - m[1, 1],
+            ],
+        ]
+    )
+    quaternion: Floats = np.linalg.eigh(k, "L")[1][:, -1]
+    return quaternion if quaternion[0] >= 0 else -quaternion

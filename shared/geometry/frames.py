@@ -1,0 +1,415 @@
+"""Frames: east-north-up on the ellipsoid, similarities that lead into it, and headings.
+
+`shared.geodesy` has distances on the sphere; here a metre is one on the ellipsoid WGS 84.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.geometry.cameras import Floats
+
+SEMI_MAJOR_M, FLATTENING = 6_378_137.0, 1 / 298.257223563  # WGS 84
+ECCENTRICITY_2 = FLATTENING * (2 - FLATTENING)
+
+MIN_PHOTOS = 3
+MIN_SPREAD = 0.02
+"""Least extent of photos across their line as a share of that along it"""
+ROLL_SIGMA = math.radians(5)
+"""Of upright photos: how far their cameras are turned about the direction in which they look"""
+UNKNOWN_ALTITUDE_SIGMA_M = 10.0
+"""Of a photo without an altitude, which is taken to be as high as the others"""
+MAX_TYPICAL_ERROR = 4.0
+"""Median distance to the coordinates in expected standard deviations"""
+MAX_SCALE_SIGMA = 0.3
+"""of ln(scale)"""
+SAMPLES = 300
+ITERATIONS = 30
+INLIER_SIGMAS = 3.0
+
+FLU_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""From a camera's axes (right, down, forward) to a body's (forward, left, up)"""
+
+
+@dataclass(frozen=True)
+class EastNorthUp:
+    """The plane that touches the ellipsoid WGS 84 at a point: x east, y north, z up, in metres.
+
+    Coordinates pass through earth-centred ones, so poles and the antimeridian are no exception.
+    """
+
+    latitude: float
+    """degrees"""
+    longitude: float
+    altitude_m: float = 0.0
+    """above the ellipsoid"""
+
+    @cached_property
+    def axes(self) -> Floats:
+        """(3, 3): rows east, north and up in earth-centred axes."""
+        phi, lam = math.radians(self.latitude), math.radians(self.longitude)
+        east = [-math.sin(lam), math.cos(lam), 0.0]
+        up = [math.cos(phi) * math.cos(lam), math.cos(phi) * math.sin(lam), math.sin(phi)]
+        return np.array([east, np.cross(up, east), up])
+
+    @cached_property
+    def _origin(self) -> Floats:
+        place = (self.latitude, self.longitude, self.altitude_m)
+        origin: Floats = _earth_centred(*(np.array(value) for value in place))
+        return origin
+
+    def from_geographic(self, latitudes: Any, longitudes: Any, altitudes_m: Any) -> Floats:
+        """Return the (n, 3) metres of (n,) degrees, degrees and metres."""
+        places = (np.asarray(v, float) for v in (latitudes, longitudes, altitudes_m))
+        metres: Floats = (_earth_centred(*places) - self._origin) @ self.axes.T
+        return metres
+
+    def to_geographic(self, metres: Floats) -> EastNorthUp:
+        """Return the point (3,) with the plane that touches the ellipsoid there.
+
+        The latitude is that of Bowring (Survey Review 28, 1985): exact to a micrometre near the
+        ground.
+        """
+        x, y, z = (self._origin + metres @ self.axes).tolist()
+        from_axis = math.hypot(x, y)
+        semi_minor = SEMI_MAJOR_M * (1 - FLATTENING)
+        theta = math.atan2(z * SEMI_MAJOR_M, from_axis * semi_minor)
+        phi = math.atan2(
+            z + ECCENTRICITY_2 / (1 - ECCENTRICITY_2) * semi_minor * math.sin(theta) ** 3,
+            from_axis - ECCENTRICITY_2 * SEMI_MAJOR_M * math.cos(theta) ** 3,
+        )
+        normal = SEMI_MAJOR_M / math.sqrt(1 - ECCENTRICITY_2 * math.sin(phi) ** 2)
+        altitude = from_axis * math.cos(phi) + z * math.sin(phi) - SEMI_MAJOR_M**2 / normal
+        return EastNorthUp(math.degrees(phi), math.degrees(math.atan2(y, x)), altitude)
+
+
+def _earth_centred(latitudes: Floats, longitudes: Floats, altitudes_m: Floats) -> Floats:
+    phi, lam = np.radians(latitudes), np.radians(longitudes)
+    normal = SEMI_MAJOR_M / np.sqrt(1 - ECCENTRICITY_2 * np.sin(phi) ** 2)
+    across = (normal + altitudes_m) * np.cos(phi)
+    return np.stack(
+        [
+            across * np.cos(lam),
+            across * np.sin(lam),
+            (normal * (1 - ECCENTRICITY_2) + altitudes_m) * np.sin(phi),
+        ],
+        axis=-1,
+    )
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """Leads from the frame of a component to east-north-up: scale * rotation @ X + translation."""
+
+    scale: float
+    """metres in a unit of the component"""
+    rotation: Floats
+    """(3, 3)"""
+    translation: Floats
+    """(3,) metres"""
+    covariance: Floats
+    """(7, 7) of a turn in east-north-up (3, radians), a shift (3, metres) and ln(scale): what is
+    applied to the turned and scaled points relative to `pivot`"""
+    pivot: Floats
+    """(3,) metres: the middle of the photos, about which the similarity is turned and scaled"""
+    drift_m: float = 0.0
+    """standard deviation of what no similarity explains, because the model or the coordinates are
+    bent"""
+    knows_altitude: bool = True
+
+    def apply(self, points: Floats) -> Floats:
+        """Return (n, 3) or (3,) points of the component in east-north-up, metres."""
+        moved: Floats = self.scale * points @ self.rotation.T + self.translation
+        return moved
+
+    def position_covariance(self, point: Floats) -> Floats:
+        """Return the (3, 3) covariance, in square metres, of a point (3,) of the component.
+
+        It is that of the similarity alone; the drift counts in each direction.
+        """
+        jacobian = _similarity_jacobian(self.apply(point)[None] - self.pivot)[0]
+        covariance: Floats = jacobian @ self.covariance @ jacobian.T + np.eye(3) * self.drift_m**2
+        return covariance
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what `from_json` reads."""
+        return {
+            "scale": self.scale,
+            "rotation": self.rotation.tolist(),
+            "translation": self.translation.tolist(),
+            "covariance": self.covariance.tolist(),
+            "pivot": self.pivot.tolist(),
+            "drift_m": self.drift_m,
+            "knows_altitude": self.knows_altitude,
+        }
+
+    @classmethod
+    def from_json(cls, value: dict[str, Any]) -> Self:
+        """Return the similarity of `as_json`."""
+        arrays = ("rotation", "translation", "covariance", "pivot")
+        read: dict[str, Any] = {
+            name: np.array(item, float) if name in arrays else item for name, item in value.items()
+        }
+        return cls(**read)
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """A component in a plane at the middle of its photos' coordinates."""
+
+    origin: EastNorthUp
+    similarity: Similarity
+    rms_m: float
+    """of the horizontal distances between the photos that agree and their coordinates"""
+    residuals_m: Floats
+    """(n,) horizontal distance of each photo with coordinates; NaN without"""
+    is_inlier: NDArray[np.bool_]
+    """(n,) photos whose coordinates agree with most others"""
+
+
+def align(
+    centres: Floats,
+    rotations: Sequence[Floats],
+    latitudes: Floats,
+    longitudes: Floats,
+    altitudes_m: Floats,
+    sigmas_m: Floats,
+) -> Alignment | str:
+    """Align a component with the coordinates of its photos, or say in words why that is impossible.
+
+    The similarity minimises the squared distances over `sigmas_m`, each at most INLIER_SIGMAS of
+    the noise that the photos show, and the squared angles by which cameras lean to a side over
+    ROLL_SIGMA: photos are upright. Its covariance has the size that the residuals show. Errors of
+    neighbours that are alike, because GPS is off by the same for minutes or the model is bent,
+    enlarge it.
+
+    Args:
+        centres: (n, 3) positions in the component, in the order in which they were taken.
+        rotations: of each photo (3, 3), from the component to its camera's axes.
+        latitudes, longitudes: (n,) degrees; NaN without coordinates.
+        altitudes_m: (n,) metres; NaN where unknown.
+        sigmas_m: (n,) expected standard deviation of the coordinates in each direction.
+    """
+    known = np.flatnonzero(np.isfinite(latitudes) & np.isfinite(longitudes))
+    if len(known) < MIN_PHOTOS:
+        return f"{len(known)} of its photos have coordinates, and {MIN_PHOTOS} are needed"
+    altitudes = altitudes_m[known]
+    knows_altitude = bool(np.isfinite(altitudes).sum() >= MIN_PHOTOS)
+    middle = float(np.nanmedian(altitudes)) if knows_altitude else 0.0
+    origin = _plane_at(latitudes[known], longitudes[known], middle)
+    is_high = np.isfinite(altitudes) & knows_altitude
+    targets = origin.from_geographic(
+        latitudes[known], longitudes[known], np.where(is_high, altitudes, middle)
+    )
+    sigmas = np.repeat(sigmas_m[known, None], 3, axis=1)
+    sigmas[~is_high, 2] = np.hypot(sigmas[~is_high, 2], UNKNOWN_ALTITUDE_SIGMA_M)
+    points = centres[known]
+    rights = np.array([rotations[i][0] for i in known.tolist()])
+    for what, places in (("coordinates", targets[:, :2]), ("reconstructed positions", points)):
+        extents = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
+        if extents[1] <= max(MIN_SPREAD * extents[0], np.abs(places).max() * 1e-9):
+            return f"the {what} of its photos are all on a line"
+    start = _robust_start(points, targets, sigmas)
+    fitted = _refine(start, points, targets, sigmas, rights, knows_altitude)
+    residuals = targets - fitted[0].apply(points)
+    distances = np.full(len(centres), np.nan)
+    distances[known] = np.linalg.norm(residuals[:, :2], axis=1)
+    typical = float(np.median(distances[known] / sigmas_m[known]))
+    spread = float(np.median(np.linalg.norm((targets - np.median(targets, axis=0))[:, :2], axis=1)))
+    middle_distance = float(np.nanmedian(distances))
+    scatters = spread > 2 * np.median(sigmas_m[known]) and middle_distance > spread / 2
+    if typical > MAX_TYPICAL_ERROR or scatters:
+        return (
+            f"half of its photos are {middle_distance:.0f} m or more from their coordinates: these "
+            "or the reconstruction are wrong"
+        )
+    if fitted[0].covariance[6, 6] > MAX_SCALE_SIGMA**2:
+        return "its photos are too close to each other for the errors of their coordinates"
+    agrees = np.zeros(len(centres), dtype=bool)
+    agrees[known] = fitted[1]
+    rms = float(np.sqrt(np.mean(distances[agrees] ** 2)))
+    return Alignment(origin, fitted[0], rms, distances, agrees)
+
+
+def _plane_at(latitudes: Floats, longitudes: Floats, altitude_m: float) -> EastNorthUp:
+    """Return the plane at the middle of the places, also around a pole or the antimeridian."""
+    middle = np.median(_earth_centred(latitudes, longitudes, np.zeros(len(latitudes))), axis=0)
+    first = EastNorthUp(float(latitudes[0]), float(longitudes[0]))
+    found = first.to_geographic((middle - first._origin) @ first.axes.T)
+    return EastNorthUp(found.latitude, found.longitude, altitude_m)
+
+
+def umeyama(points: Floats, targets: Floats, weights: Floats) -> tuple[float, Floats, Floats]:
+    """Return scale, rotation and translation of the weighted similarity (Umeyama, PAMI 1991)."""
+    weights = weights / weights.sum()
+    middle, target_middle = weights @ points, weights @ targets
+    centred, target_centred = points - middle, targets - target_middle
+    u, values, vt = np.linalg.svd((target_centred * weights[:, None]).T @ centred)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt)) or 1.0])
+    rotation = u * signs @ vt
+    variance = float(weights @ np.sum(centred**2, axis=1))
+    scale = float(values @ signs) / max(variance, 1e-300)
+    return scale, rotation, target_middle - scale * rotation @ middle
+
+
+def _robust_start(points: Floats, targets: Floats, sigmas: Floats) -> Similarity:
+    """Return the similarity of three photos with the least median error (LMedS)."""
+    rng = np.random.default_rng(0)
+    weights = 1 / sigmas[:, 0] ** 2
+    best, least = None, math.inf
+    for number in range(SAMPLES + 1):
+        rows = np.arange(len(points)) if not number else rng.choice(len(points), 3, replace=False)
+        scale, rotation, translation = umeyama(points[rows], targets[rows], weights[rows])
+        if not scale > 0:
+            continue
+        errors = (scale * points @ rotation.T + translation - targets) / sigmas
+        error = float(np.median(np.sum(errors**2, axis=1)))
+        if error < least:
+            best, least = (scale, rotation, translation), error
+    assert best is not None  # scale is 0 only of coinciding points
+    return Similarity(*best, np.zeros((7, 7)), targets.mean(axis=0))
+
+
+def _refine(
+    start: Similarity,
+    points: Floats,
+    targets: Floats,
+    sigmas: Floats,
+    rights: Floats,
+    knows_altitude: bool,
+) -> tuple[Similarity, NDArray[np.bool_]]:
+    """Return the refined similarity with its covariance, and which photos agree with it."""
+    scale, rotation, translation = start.scale, start.rotation, start.translation
+    count = len(points)
+    for _ in range(ITERATIONS):
+        moved = scale * points @ rotation.T + translation
+        pivot = moved.mean(axis=0)
+        errors = (targets - moved) / sigmas
+        distances = np.linalg.norm(errors[:, :2], axis=1)
+        # Rayleigh: the median of two dimensions is 1.1774 standard deviations.
+        noise = max(float(np.median(distances)) / 1.1774, 1e-3)
+        is_inlier = distances <= INLIER_SIGMAS * noise
+        jacobian = _similarity_jacobian(moved - pivot) / sigmas[:, :, None]
+        jacobian, errors = jacobian[is_inlier] / noise, errors[is_inlier] / noise
+        # The height of a photo's right side, z, is 0; a turn t changes it by (t x right) . z.
+        leaning = rights @ rotation.T
+        roll_jacobian = np.zeros((count, 7))
+        roll_jacobian[:, 0], roll_jacobian[:, 1] = leaning[:, 1], -leaning[:, 0]
+        roll_weights = 1 / (ROLL_SIGMA * (1 + (leaning[:, 2] / ROLL_SIGMA) ** 2))
+        rows = np.concatenate([jacobian.reshape(-1, 7), roll_jacobian * roll_weights[:, None]])
+        values = np.concatenate([errors.ravel(), -leaning[:, 2] * roll_weights])
+        normal = rows.T @ rows + 1e-12 * np.eye(7)
+        step = np.linalg.solve(normal, rows.T @ values)
+        turn, factor = rotation_of_vector(step[:3]), math.exp(step[6])
+        translation = factor * turn @ (translation - pivot) + pivot + step[3:6]
+        rotation, scale = turn @ rotation, scale * factor
+        if np.abs(step).max() < 1e-9:
+            break
+    residuals = (targets - scale * points @ rotation.T - translation)[is_inlier]
+    alike = _likeness_of_neighbours(residuals[:, :2])
+    spread = float(np.sqrt(np.mean(residuals[:, :2] ** 2)))
+    covariance = np.linalg.inv(normal) * (1 + alike) / (1 - alike)
+    drift = spread * math.sqrt(alike)
+    pivot = (scale * points @ rotation.T + translation).mean(axis=0)
+    found = Similarity(scale, rotation, translation, covariance, pivot, drift, knows_altitude)
+    return found, is_inlier
+
+
+def _likeness_of_neighbours(residuals: Floats) -> float:
+    """Return the correlation of (n, 2) residuals with their successors, from 0 to 0.95."""
+    if len(residuals) < 2 * MIN_PHOTOS or not (square := float(np.mean(residuals**2))):
+        return 0.0
+    return min(0.95, max(0.0, float(np.mean(residuals[1:] * residuals[:-1])) / square))
+
+
+def _similarity_jacobian(offsets: Floats) -> Floats:
+    """Return the (n, 3, 7) derivatives of points, given relative to the pivot."""
+    jacobian = np.zeros((len(offsets), 3, 7))
+    jacobian[:, :, :3] = -cross_matrices(offsets)
+    jacobian[:, :, 3:6] = np.eye(3)
+    jacobian[:, :, 6] = offsets
+    return jacobian
+
+
+def cross_matrices(vectors: Floats) -> Floats:
+    """Return the (n, 3, 3) matrices [v] of (n, 3) vectors, [v] @ w = v x w."""
+    matrices = np.zeros((len(vectors), 3, 3))
+    x, y, z = vectors.T
+    matrices[:, 0, 1], matrices[:, 0, 2], matrices[:, 1, 2] = -z, y, -x
+    return matrices - matrices.transpose(0, 2, 1)
+
+
+def rotation_of_vector(vector: Floats) -> Floats:
+    """Return the (3, 3) rotation about a vector (3,) by its length in radians (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    cross = cross_matrices(np.asarray(vector)[None])[0]
+    sine = np.sinc(angle / math.pi)
+    versine = 0.5 * np.sinc(angle / (2 * math.pi)) ** 2
+    rotation: Floats = np.eye(3) + sine * cross + versine * cross @ cross
+    return rotation
+
+
+@dataclass(frozen=True, slots=True)
+class Attitude:
+    """Where a camera looks, in degrees."""
+
+    heading: float
+    """clockwise from north, from 0 to 360"""
+    pitch: float
+    """upwards, from -90 to 90"""
+    roll: float
+    """clockwise about the direction of view, from -180 to 180"""
+
+
+def attitude_of(rotation: Floats) -> Attitude:
+    """Return the attitude of a camera from its (3, 3) rotation from east-north-up to its axes.
+
+    Rolling clockwise turns the right side down. A camera that looks straight up or down has the
+    heading of its upper or lower edge, and no roll.
+    """
+    right, _, forward = rotation
+    pitch = math.asin(float(np.clip(forward[2], -1, 1)))
+    if math.hypot(forward[0], forward[1]) < 1e-9:
+        heading, roll = math.atan2(-right[1], right[0]), 0.0
+    else:
+        heading = math.atan2(forward[0], forward[1])
+        level = np.array([math.cos(heading), -math.sin(heading), 0.0])
+        roll = math.atan2(float(level @ rotation[1]) * -1, float(level @ right))
+    return Attitude(math.degrees(heading) % 360, math.degrees(pitch), math.degrees(roll))
+
+
+def geopose_rotation(rotation: Floats) -> Floats:
+    """Return the (3, 3) rotation of OGC GeoPose 1.0 (21-056r11), from the inner to the outer frame.
+
+    The outer frame is east-north-up at the camera. The standard leaves the inner one to the object;
+    here it is the camera's forward (x), left (y) and up (z), as in ROS (REP 103). So the identity
+    looks east.
+
+    Args:
+        rotation: (3, 3) from east-north-up to the camera's axes.
+    """
+    found: Floats = rotation.T @ FLU_FROM_CAMERA.T
+    return found
+
+
+def geopose_angles(rotation: Floats) -> tuple[float, float, float]:
+    """Return yaw, pitch and roll of GeoPose in degrees for `geopose_rotation`'s argument.
+
+    The inner frame is turned about z (up) by the yaw, then about the new y (left) by the pitch,
+    then about the new x (forward) by the roll: the yaw grows counterclockwise from east, and a
+    positive pitch looks down.
+    """
+    m = geopose_rotation(rotation)
+    pitch = math.asin(float(np.clip(-m[2, 0], -1, 1)))
+    if math.hypot(m[0, 0], m[1, 0]) < 1e-9:
+        yaw, roll = math.atan2(-m[0, 1], m[1, 1]), 0.0
+    else:
+        yaw, roll = math.atan2(m[1, 0], m[0, 0]), math.atan2(m[2, 1], m[2, 2])
+    return math.degrees(yaw), math.degrees(pitch), math.degrees(roll)

@@ -1,0 +1,132 @@
+"""Radii of poses: the covariance of a pose, scaled by what the map's own photos show."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from shared.geometry.cameras import Floats
+from shared.geometry.component import quaternion_of
+from shared.geometry.frames import (
+    Attitude,
+    EastNorthUp,
+    Similarity,
+    attitude_of,
+    geopose_angles,
+    geopose_rotation,
+)
+from shared.geometry.localise import LocalPose
+
+NORMAL_68, NORMAL_95 = 1.07, 1.96
+"""Quantiles of the length of a normal vector over its root mean square: the larger one of vectors
+of one (1.00, 1.96) and two dimensions (1.07, 1.73)"""
+NORMAL_68_OF_ANGLE = 0.994
+
+
+class PoseCalibration(BaseModel):
+    """How far poses are off, compared with their covariance: quantiles over left-out photos."""
+
+    model_config = ConfigDict(frozen=True)
+
+    position_68: float = Field(gt=0)
+    """error of the position over its standard deviation"""
+    position_95: float = Field(gt=0)
+    heading_68: float = Field(gt=0)
+    heading_95: float = Field(gt=0)
+    share_found: float = Field(ge=0, le=1)
+    """of the left-out photos that were found"""
+    poses: int = Field(ge=0)
+    """found; with fewer than 40 the quantiles are hardly more than a guess"""
+
+
+@dataclass(frozen=True, slots=True)
+class GeoPose:
+    """A pose on the earth with calibrated radii."""
+
+    latitude: float
+    longitude: float
+    altitude_m: float | None
+    """None if the map's photos have no altitudes"""
+    attitude: Attitude
+    quaternion: tuple[float, float, float, float]
+    """w, x, y, z of `geopose_rotation`"""
+    yaw_pitch_roll: tuple[float, float, float]
+    """`geopose_angles`"""
+    radius_68_m: float
+    radius_95_m: float
+    heading_68_degrees: float
+
+
+def geo_pose(
+    pose: LocalPose, origin: EastNorthUp, similarity: Similarity, calibration: PoseCalibration
+) -> GeoPose:
+    """Return a pose on the earth.
+
+    The square of a radius is the sum of that of the pose in its component, the calibrated quantile
+    times its standard deviation, and that of the alignment at its position. Heading, pitch and roll
+    are relative to north and up at the position itself, not at the origin.
+    """
+    place = origin.to_geographic(similarity.apply(pose.position))
+    # From the plane at the position to that at the origin.
+    turn = origin.axes @ place.axes.T
+    rotation = pose.rotation @ similarity.rotation.T @ turn
+    to_enu = turn.T @ similarity.rotation
+    sigma = similarity.scale * horizontal_sigma(pose.covariance, to_enu)
+    aligned = math.sqrt(float(np.trace(similarity.position_covariance(pose.position)[:2, :2])))
+    heading = heading_sigma(pose.covariance, pose.rotation, to_enu)
+    jacobian = _heading_jacobian(rotation) @ turn.T
+    of_alignment = math.sqrt(float(jacobian @ similarity.covariance[:3, :3] @ jacobian))
+    degrees = math.degrees(
+        math.hypot(calibration.heading_68 * heading, NORMAL_68_OF_ANGLE * of_alignment)
+    )
+    return GeoPose(
+        place.latitude,
+        place.longitude,
+        place.altitude_m if similarity.knows_altitude else None,
+        attitude_of(rotation),
+        tuple(quaternion_of(geopose_rotation(rotation)).tolist()),
+        geopose_angles(rotation),
+        math.hypot(calibration.position_68 * sigma, NORMAL_68 * aligned),
+        math.hypot(calibration.position_95 * sigma, NORMAL_95 * aligned),
+        min(180.0, degrees),
+    )
+
+
+def horizontal_sigma(covariance: Floats, rotation: Floats | None) -> float:
+    """Return the root mean square of the horizontal error of a pose, in units of its component.
+
+    Args:
+        covariance: (6, 6) of `LocalPose`.
+        rotation: (3, 3) from the component to east-north-up; None if it is not aligned: then the
+            error counts in all three dimensions.
+    """
+    if rotation is None:
+        return math.sqrt(float(np.trace(covariance[:3, :3])))
+    return math.sqrt(float(np.trace((rotation @ covariance[:3, :3] @ rotation.T)[:2, :2])))
+
+
+def heading_sigma(covariance: Floats, rotation: Floats, to_enu: Floats | None) -> float:
+    """Return the standard deviation of a pose's heading in radians.
+
+    Args:
+        covariance: (6, 6) of `LocalPose`.
+        rotation: (3, 3) from the component to the camera's axes.
+        to_enu: (3, 3) from the component to east-north-up; None if it is not aligned: then it is
+            that of a turn about the camera's y axis.
+    """
+    jacobian = rotation[1]
+    if to_enu is not None:
+        jacobian = _heading_jacobian(rotation @ to_enu.T) @ to_enu
+    return math.sqrt(float(jacobian @ covariance[3:, 3:] @ jacobian))
+
+
+def _heading_jacobian(rotation: Floats) -> Floats:
+    """Return the (3,) derivatives of the heading by a turn of the camera in east-north-up."""
+    east, north, up = rotation[2]
+    square = max(east**2 + north**2, 1e-12)
+    # A turn t changes the direction of view, f, by t x f.
+    found: Floats = np.array([up * east, up * north, -square]) / square
+    return found
