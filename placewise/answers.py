@@ -44,7 +44,11 @@ class Photo(Answer):
     tags: list[str]
     latitude: float | None
     longitude: float | None
+    altitude: float | None
+    """metres"""
     heading: float | None
+    focal_length: float | None
+    """of EXIF, as a multiple of the longer side"""
     captured_at: datetime | None
     place: str | None
     role: str

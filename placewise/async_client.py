@@ -43,8 +43,8 @@ class AsyncClient(AsyncTransport):
         Args:
             photo: The file: its path, or open for reading bytes, such as io.BytesIO.
             filename: Name to store; None for the name of the path.
-            fields: Form fields: `latitude` and `longitude` (degrees), `heading`, `captured_at`,
-                `place`, `tags`, `metadata`, `role`, `relative_path`.
+            fields: Form fields: `latitude` and `longitude` (degrees), `altitude` (metres),
+                `heading`, `captured_at`, `place`, `tags`, `metadata`, `role`, `relative_path`.
 
         Raises:
             Conflict: `photo_differs` if the map contains the same image with other metadata.

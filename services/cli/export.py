@@ -40,6 +40,7 @@ PHOTO_PROPERTIES = {
     "relative_path",
     "upload_time",
     "captured_at",
+    "altitude",
     "heading",
     "place",
     "tags",

@@ -39,7 +39,13 @@ from services.extractor.handlers import HANDLERS, DrainStats, ExtractorContext, 
 from services.extractor.metrics import ExtractorMetrics
 from services.extractor.model_registry import ModelRegistry
 from shared.catalog.database.session import Catalog
-from shared.catalog.jobs import EXTRACTOR_JOBS, FIT_JOBS, MODEL_CHANGE_JOBS, JobKind, WaitingFor
+from shared.catalog.jobs import (
+    CHILD_PROCESS_JOBS,
+    EXTRACTOR_JOBS,
+    MODEL_CHANGE_JOBS,
+    JobKind,
+    WaitingFor,
+)
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
 from shared.jobs import InProcessWakeups, Job, Priority
@@ -88,7 +94,7 @@ class ExtractorWorker:
         )
         on_outcome = self._metrics.count_step_outcome
         self.fits = FitWorker(self.context, name, on_outcome, compute_fit)
-        drained = [kind for kind in EXTRACTOR_JOBS if kind not in FIT_JOBS]
+        drained = [kind for kind in EXTRACTOR_JOBS if kind not in CHILD_PROCESS_JOBS]
         self._runner = JobRunner(catalog, settings, name, drained, on_outcome)
         # Two threads, so that a query's photo does not wait for the photos of the next batch.
         self._prepare_executor = ThreadPoolExecutor(max_workers=2, thread_name_prefix="prepare")

@@ -61,7 +61,11 @@ class PhotoResponse(ResponseModel):
     tags: list[str]
     latitude: float | None
     longitude: float | None
+    altitude: float | None = Field(description="metres")
     heading: float | None
+    focal_length: float | None = Field(
+        description="of EXIF, as a multiple of the longer side; null if unknown"
+    )
     captured_at: datetime | None
     place: str | None
     role: PhotoRole

@@ -73,11 +73,16 @@ class JobKind(StrEnum):
     ADD_MODEL = "add_model"  # check a checkpoint and register it as a model, for any map
     EVALUATE = "evaluate"  # search the map with photos whose place is known; compute recall
     WORD_WEIGHTS = "word_weights"  # fit weights of the words of the map's vocabulary
+    RECONSTRUCT = "reconstruct"  # reconstruct the map's photos (`shared.catalog.reconstructions`)
     BATCH = "batch"  # import many photos, each with its own job (`shared.catalog.batch_items`)
 
 
 FIT_JOBS = (JobKind.FIT, JobKind.PCA)
+CHILD_PROCESS_JOBS = (*FIT_JOBS, JobKind.RECONSTRUCT)  # run beside the describing of photos
 MODEL_CHANGE_JOBS = (*FIT_JOBS, JobKind.IMPORT, JobKind.SWITCH)
+
+# Their parameter `object_key` is the key of an upload (`CHECKPOINTS`), or None.
+UPLOAD_JOBS = (JobKind.ADD_MODEL, JobKind.RECONSTRUCT)
 
 # Retention of query photos: long enough for a client that polls, and for the background of a track;
 # short, because nobody has chosen to store these photos.
@@ -89,6 +94,7 @@ EXTRACTOR_JOBS = (
     JobKind.REINDEX,
     JobKind.DESCRIBE,
     JobKind.ADD_MODEL,
+    JobKind.RECONSTRUCT,
     *MODEL_CHANGE_JOBS,
 )
 STEWARD_JOBS = (JobKind.EVALUATE, JobKind.WORD_WEIGHTS, JobKind.BATCH)
@@ -97,7 +103,7 @@ STEWARD_JOBS = (JobKind.EVALUATE, JobKind.WORD_WEIGHTS, JobKind.BATCH)
 CHECKPOINTED_JOBS = (*MODEL_CHANGE_JOBS, JobKind.BATCH)
 
 # Claimed one at a time: each is as much work as a batch, or changes the input of the next one.
-SINGLE_CLAIM_JOBS = (*MODEL_CHANGE_JOBS, JobKind.ADD_MODEL)
+SINGLE_CLAIM_JOBS = (*MODEL_CHANGE_JOBS, JobKind.ADD_MODEL, JobKind.RECONSTRUCT)
 
 
 class Priority(IntEnum):

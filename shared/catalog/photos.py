@@ -37,7 +37,9 @@ class Photo(Journaled, Base):
     """A live or deleted photo. `sha256` is unique among the live photos of a map.
 
     `job_id` is the job that describes the photo; the photo is searchable if it has a row in
-    `descriptors`. `changed_version` is the map's version at the last change that affects searches.
+    `descriptors`. `altitude` is in metres, above the sea where its source says so; `focal_length`
+    is a multiple of the longer side. `changed_version` is the map's version at the last change that
+    affects searches.
     """
 
     __tablename__ = "photos"
@@ -58,7 +60,9 @@ class Photo(Journaled, Base):
     height: Mapped[int] = mapped_column(sa.Integer)
     latitude: Mapped[float | None] = mapped_column(CoordinateColumn)
     longitude: Mapped[float | None] = mapped_column(CoordinateColumn)
+    altitude: Mapped[float | None] = mapped_column(sa.Float)
     heading: Mapped[float | None] = mapped_column(sa.Float)
+    focal_length: Mapped[float | None] = mapped_column(sa.Float)
     captured_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     place: Mapped[str | None] = mapped_column(sa.Text)
     tags: Mapped[list[str]] = mapped_column(JsonValue, default=list)

@@ -17,6 +17,7 @@ from shared.catalog import (  # noqa: F401
     models,
     photos,
     processes,
+    reconstructions,
     tracks,
     vocabularies,
     webhooks,

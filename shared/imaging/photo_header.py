@@ -20,17 +20,31 @@ from shared.imaging.file_formats import PHOTO_READ_ERRORS, check_pixel_count
 from shared.imaging.file_structure import read_structure
 
 MAIN_TAGS = (Base.Orientation, Base.Make, Base.Model, IFD.Exif, IFD.GPSInfo)
-CAMERA_TAGS = (Base.DateTimeOriginal, Base.OffsetTimeOriginal, Base.BodySerialNumber)
+CAMERA_TAGS = (
+    *(Base.DateTimeOriginal, Base.OffsetTimeOriginal, Base.BodySerialNumber),
+    *(Base.FocalLengthIn35mmFilm, Base.FocalLength),
+    *(Base.FocalPlaneXResolution, Base.FocalPlaneResolutionUnit),
+    *(Base.ExifImageWidth, Base.ExifImageHeight),
+)
 GPS_TAGS = (
     GPS.GPSLatitudeRef,
     GPS.GPSLatitude,
     GPS.GPSLongitudeRef,
     GPS.GPSLongitude,
+    GPS.GPSAltitudeRef,
+    GPS.GPSAltitude,
     GPS.GPSTimeStamp,
     GPS.GPSDateStamp,
     GPS.GPSImgDirection,
 )
 ROTATED_ORIENTATIONS = (5, 6, 7, 8)  # EXIF orientations that swap width and height
+BELOW_ZERO = (b"\1", b"\3")  # GPSAltitudeRef: below the sea, below the ellipsoid
+MAX_ALTITUDE_M = 100_000
+FILM_WIDTH_MM = 36
+# Millimetres by FocalPlaneResolutionUnit; an inch if it is missing.
+UNITS_MM = {None: 25.4, 2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+# Multiples of the longer side: from a fisheye to a telescope. Others are of a broken file.
+MIN_FOCAL_LENGTH, MAX_FOCAL_LENGTH = 0.1, 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +57,8 @@ class PhotoHeader:
     latitude: float | None = None
     """degrees, WGS 84"""
     longitude: float | None = None
+    altitude: float | None = None
+    """metres, as the camera's GPS gives them"""
     heading: float | None = None
     """degrees clockwise from north, in [0, 360)"""
     captured_at: datetime | None = None
@@ -50,6 +66,8 @@ class PhotoHeader:
     time_zone_is_known: bool = False
     camera: str | None = None
     """make, model and serial number"""
+    focal_length: float | None = None
+    """multiple of the longer side"""
 
 
 def read_photo_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
@@ -80,10 +98,12 @@ def read_photo_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
         height=height,
         latitude=latitude,
         longitude=longitude,
+        altitude=_altitude(gps),
         heading=heading % 360 if heading is not None else None,
         captured_at=gps_time or clock,
         time_zone_is_known=gps_time is not None or time_zone_is_known,
         camera=_camera(main, details),
+        focal_length=_focal_length(details, max(width, height)),
     )
 
 
@@ -123,6 +143,30 @@ def _degrees(parts: Any, reference: Any, signs: str, limit: float) -> float | No
     if sign:
         value = -value
     return value if abs(value) <= limit else None
+
+
+def _altitude(gps: dict[int, Any]) -> float | None:
+    altitude = _number(gps.get(GPS.GPSAltitude))
+    if altitude is None or not abs(altitude) <= MAX_ALTITUDE_M:
+        return None
+    return -altitude if gps.get(GPS.GPSAltitudeRef) in BELOW_ZERO else altitude
+
+
+def _focal_length(details: dict[int, Any], longer_side: int) -> float | None:
+    """Return the focal length as a multiple of the longer side (Exif 3.0, 4.6.6)."""
+    on_film = _number(details.get(Base.FocalLengthIn35mmFilm))  # 0 for unknown
+    millimetres = _number(details.get(Base.FocalLength))
+    pixels_per_unit = _number(details.get(Base.FocalPlaneXResolution))
+    unit = UNITS_MM.get(details.get(Base.FocalPlaneResolutionUnit))
+    focal_length = 0.0
+    if on_film:
+        focal_length = on_film / FILM_WIDTH_MM
+    elif millimetres and pixels_per_unit and unit:
+        # The resolution is that of the photo as it was taken: this file may be a smaller copy.
+        sides = (details.get(tag) for tag in (Base.ExifImageWidth, Base.ExifImageHeight))
+        taken = max((side for side in sides if isinstance(side, int)), default=0)
+        focal_length = millimetres / unit * pixels_per_unit / (taken or longer_side)
+    return focal_length if MIN_FOCAL_LENGTH <= focal_length <= MAX_FOCAL_LENGTH else None
 
 
 def _camera(main: dict[int, Any], details: dict[int, Any]) -> str | None:

@@ -19,6 +19,7 @@ from typing import Any
 
 from shared.catalog.photo_role import PhotoRole
 from shared.errors import InvalidRequest, PlacewiseError, TooLarge, invalid_field_error
+from shared.imaging.photo_header import MAX_ALTITUDE_M
 
 MAX_TAGS = 50
 MAX_METADATA_CHARACTERS = 100_000
@@ -37,6 +38,7 @@ class PhotoFields:
 
     latitude: float | None = None
     longitude: float | None = None
+    altitude: float | None = None
     heading: float | None = None
     captured_at: datetime | None = None
     place: str | None = None
@@ -66,6 +68,7 @@ def read_form_fields(form: dict[str, str]) -> PhotoFields:
     fields = PhotoFields(
         latitude=_number(values, "latitude", -90, 90),
         longitude=_number(values, "longitude", -180, 180),
+        altitude=_number(values, "altitude", -MAX_ALTITUDE_M, MAX_ALTITUDE_M),
         heading=_heading(values),
         captured_at=parse_time("captured_at", values["captured_at"])
         if "captured_at" in values
@@ -226,7 +229,7 @@ def _is_deeper_than(levels: int, value: Any) -> bool:
 
 MAX_MANIFEST_BYTES = 32 * 1024 * 1024
 NAME_COLUMNS = ("filename", "file", "path")
-CSV_COLUMNS = ("latitude", "longitude", "heading", "captured_at", "place", "tags")
+CSV_COLUMNS = ("latitude", "longitude", "altitude", "heading", "captured_at", "place", "tags")
 KEY_FIELD = "key"  # in a manifest of objects to import
 FORMULA = re.compile("'*[=+@\\t\\r-]")  # such a cell is a formula in a spreadsheet, or was escaped
 MAX_REPORTED_LINES = 20  # bad lines in an error message
@@ -388,7 +391,7 @@ def _as_form_text(field: str, value: Any) -> str:
         if not all(isinstance(tag, str) and "," not in tag for tag in value):
             raise ValueError("tags must be strings without commas")
         return _as_form_text(field, ",".join(value))
-    if field in ("latitude", "longitude", "heading") and type(value) in (int, float):
+    if field in ("latitude", "longitude", "altitude", "heading") and type(value) in (int, float):
         return repr(value)
     raise ValueError(f"{field} can't be {json.dumps(value)[:50]}")
 

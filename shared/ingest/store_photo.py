@@ -96,7 +96,9 @@ def _photo_values(incoming: ValidatedPhoto) -> dict[str, Any]:
         "height": header.height,
         "latitude": fields.latitude if has_coordinates else header.latitude,
         "longitude": fields.longitude if has_coordinates else header.longitude,
+        "altitude": fields.altitude if fields.altitude is not None else header.altitude,
         "heading": fields.heading if fields.heading is not None else header.heading,
+        "focal_length": header.focal_length,
         "captured_at": fields.captured_at or header.captured_at,
         "place": fields.place,
         "tags": fields.tags or [],
@@ -155,6 +157,7 @@ def _differing_fields(photo: Photo, fields: PhotoFields) -> list[str]:
     stored = {
         "latitude": photo.latitude,
         "longitude": photo.longitude,
+        "altitude": photo.altitude,
         "heading": photo.heading,
         "captured_at": photo.captured_at,
         "place": photo.place,

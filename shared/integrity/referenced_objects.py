@@ -20,6 +20,7 @@ from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState
 from shared.catalog.maps import Map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
+from shared.catalog.reconstructions import Reconstruction
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.storage.chunks import features_key, manifest_key
 from shared.storage.keys import ORIGINALS
@@ -37,6 +38,7 @@ class ObjectKind(StrEnum):
     VOCABULARY = "vocabulary"
     WHITENING = "whitening"
     MODEL = "model"
+    RECONSTRUCTION = "reconstruction"
     CHECKPOINT = "checkpoint"  # upload of a model that is being added
     FILE = "file"  # of an unfinished batch, not yet a photo
 
@@ -53,7 +55,7 @@ class ReferencedObject:
     key: str
     what: ObjectKind
     row_id: UUID
-    """Id of the photo, chunk, vocabulary, whitening, model or job."""
+    """Id of the photo, chunk, vocabulary, whitening, model, reconstruction or job."""
     size_bytes: int | None = None
     """Expected size; None if unknown."""
     sha256: str | None = None
@@ -61,8 +63,8 @@ class ReferencedObject:
 
 
 def list_referenced_objects(session: Session) -> Iterator[ReferencedObject]:
-    """Iterate over the objects of live photos, models, unfinished jobs and the generations that are
-    active or being built, of maps that are not deleted."""
+    """Iterate over the objects of live photos, models, reconstructions, unfinished jobs and the
+    generations that are active or being built, of maps that are not deleted."""
     photos = select(Photo.id, Photo.object_key, Photo.size_bytes, Photo.sha256).join(
         Map, Map.id == Photo.map_id
     )
@@ -106,6 +108,11 @@ def list_referenced_objects(session: Session) -> Iterator[ReferencedObject]:
         yield ReferencedObject(
             model.object_key, ObjectKind.MODEL, model.id, model.size_bytes, model.sha256
         )
+    reconstructions = select(Reconstruction).join(Map, Map.id == Reconstruction.map_id)
+    for made in session.scalars(reconstructions.where(Map.deleted_at.is_(None))):
+        for component in made.list_components():
+            for key, sha256 in component.sha256.items():
+                yield ReferencedObject(key, ObjectKind.RECONSTRUCTION, made.id, sha256=sha256)
     jobs = select(Job.id, Job.params).where(
         Job.kind == JobKind.ADD_MODEL, Job.state.in_(UNFINISHED_STATES)
     )

@@ -128,7 +128,7 @@ class _Verifier:
     def __init__(self, catalog: Catalog, store: ObjectStore, *, originals: bool) -> None:
         self._catalog = catalog
         self._store = store
-        self._read_kinds = {ObjectKind.MODEL, ObjectKind.FEATURES}
+        self._read_kinds = {ObjectKind.MODEL, ObjectKind.FEATURES, ObjectKind.RECONSTRUCTION}
         if originals:
             self._read_kinds.add(ObjectKind.ORIGINAL)
         self.report = IntegrityReport()

@@ -41,6 +41,7 @@ from shared.catalog.jobs import Job
 from shared.catalog.maps import Map, Search
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
+from shared.catalog.reconstructions import Reconstruction
 from shared.catalog.tracks import Track, TrackFrame
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.catalog.webhooks import Delivery, Webhook
@@ -68,6 +69,7 @@ TABLES: dict[str, type[Journaled]] = {
     "generations": Generation,
     "evaluations": Evaluation,
     "photos": Photo,
+    "reconstructions": Reconstruction,
 }
 
 # Columns for the catalog's own bookkeeping, which have no meaning in another catalog.

@@ -6,7 +6,7 @@
 |---|---|
 | `originals/<uuid>` | an uploaded photo |
 | `incoming/<upload>` | a presigned upload, until it is completed |
-| `checkpoints/<uuid>` | an uploaded checkpoint, until it is added as a model or rejected |
+| `checkpoints/<uuid>` | an uploaded checkpoint or COLMAP model, until its job has ended |
 | `models/<sha256>/<uuid>.safetensors` | an added model: its configuration and weights |
 | `thumbnails/<photo>` | a photo's thumbnail, JPEG |
 | `previews/<photo>` | a preview for browsers, JPEG, of a photo that needs one |
@@ -15,6 +15,8 @@
 | `journal/<first>-<last>-<uuid>.jsonl.gz` | rows of the catalog (`shared.journal`) |
 | `vocabularies/<uuid>.npy` | VLAD centres |
 | `whitenings/<uuid>.safetensors` | PCA whitenings |
+| `reconstructions/<uuid>/matches.npz` | verified matches of a reconstruction |
+| `reconstructions/<uuid>/<n>/*.bin`, `<n>.npz` | a component: COLMAP model, and what queries read |
 | `queries/<job>`, `queries/<job>.npy` | a query photo that is not stored, and its descriptor |
 | `queries/<job>.features` | its local features |
 | `queries/<job>.jpg` | a preview of a query photo in a format that not all browsers show |

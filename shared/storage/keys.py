@@ -18,6 +18,7 @@ MODELS = "models/"
 ORIGINALS = "originals/"
 PREVIEWS = "previews/"
 QUERIES = "queries/"
+RECONSTRUCTIONS = "reconstructions/"
 THUMBNAILS = "thumbnails/"
 TRASH = "trash/"
 VOCABULARIES = "vocabularies/"
@@ -140,6 +141,16 @@ def query_object_keys(job_id: UUID) -> tuple[str, ...]:
         query_features_key(job_id),
         query_preview_key(job_id),
     )
+
+
+def reconstruction_prefix(reconstruction_id: UUID) -> str:
+    """Return the beginning of the keys of a reconstruction's objects."""
+    return f"{RECONSTRUCTIONS}{reconstruction_id}/"
+
+
+def component_key(reconstruction_id: UUID, number: int) -> str:
+    """Return the key of a component; its COLMAP model is in the folder of the same name."""
+    return f"{reconstruction_prefix(reconstruction_id)}{number}.npz"
 
 
 def new_vocabulary_key() -> str:

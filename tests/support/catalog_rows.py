@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 from dataclasses import asdict
+from datetime import UTC, datetime
 from typing import Any
 from uuid import UUID
 
@@ -23,6 +24,7 @@ from shared.catalog.jobs import MODEL_CHANGE_JOBS, UNFINISHED_STATES
 from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.models import get_or_create_model
 from shared.catalog.photos import Photo, get_photo, mark_photo_deleted
+from shared.catalog.reconstructions import ReconstructedComponent, Reconstruction
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
 from shared.jobs.claim import claim_jobs
@@ -30,7 +32,7 @@ from shared.jobs.transitions import cancel_job
 from shared.storage import ObjectStore
 from shared.storage.chunks import Rows, StoredRows, read_chunk, write_chunk
 from shared.storage.feature_files import FeatureRows
-from shared.storage.keys import new_original_key, query_key
+from shared.storage.keys import component_key, new_original_key, query_key
 
 NUMBERS = itertools.count(1)
 PRIORITIES = {
@@ -39,7 +41,9 @@ PRIORITIES = {
     JobKind.DESCRIBE: Priority.QUERY,
     JobKind.EVALUATE: Priority.EVALUATION,
     JobKind.WORD_WEIGHTS: Priority.EVALUATION,
-    **dict.fromkeys((*MODEL_CHANGE_JOBS, JobKind.ADD_MODEL), Priority.MODEL_CHANGE),
+    **dict.fromkeys(
+        (*MODEL_CHANGE_JOBS, JobKind.ADD_MODEL, JobKind.RECONSTRUCT), Priority.MODEL_CHANGE
+    ),
 }
 
 
@@ -100,6 +104,40 @@ def upload(catalog: Catalog, store: ObjectStore, map_id: UUID, data: bytes) -> t
         job = add_job(session, map_id, photo_id=photo.id)
         photo.job_id = job.id
         return photo.id, job.id
+
+
+def add_reconstruction(
+    session: Session, store: ObjectStore, generation: Generation, **columns: Any
+) -> Reconstruction:
+    """A finished reconstruction of one component, with an object of arbitrary bytes."""
+    made_id, data = new_id(), b"a component"
+    key = component_key(made_id, 0)
+    store.put(key, data)
+    component = ReconstructedComponent(
+        number=0,
+        object_key=key,
+        sha256={key: hashlib.sha256(data).hexdigest()},
+        photos=2,
+        points=3,
+        mean_reprojection_error_pixels=0.5,
+        not_aligned="No photo has coordinates.",
+    )
+    reconstruction = Reconstruction(
+        **{
+            "id": made_id,
+            "map_id": generation.map_id,
+            "job_id": new_id(),
+            "generation_id": generation.id,
+            "map_version": 1,
+            "features_model": "xfeat@1",
+            "components": [component.model_dump(mode="json")],
+            "finished_at": datetime.now(UTC),
+            **columns,
+        }
+    )
+    session.add(reconstruction)
+    session.flush()
+    return reconstruction
 
 
 def ask(catalog: Catalog, store: ObjectStore, map_id: UUID, data: bytes) -> UUID:

@@ -72,9 +72,9 @@ def index(
         Path | None,
         typer.Option(
             "--csv",
-            help="CSV table with the columns filename, latitude, longitude, heading, captured_at, "
-            "place and tags. filename is relative to the folder or archive; the other columns are "
-            "optional.",
+            help="CSV table with the columns filename, latitude, longitude, altitude, heading, "
+            "captured_at, place and tags. filename is relative to the folder or archive; the other "
+            "columns are optional.",
         ),
     ] = None,
     anyloc: Annotated[

@@ -38,7 +38,7 @@ from shared.journal.segments import (
     table_of,
 )
 from shared.storage import ObjectStore
-from shared.storage.keys import ORIGINALS, is_original_key
+from shared.storage.keys import ORIGINALS, is_original_key, reconstruction_prefix
 from shared.storage.segments import Segment, list_segments
 
 ROWS_PER_STATEMENT = 500
@@ -292,6 +292,11 @@ class _RowPreparation:
             self._rename_second_map(columns)
         elif line.table == "whitenings" and self._store.head(columns["object_key"]) is None:
             return None  # deleted, which the journal does not record
+        elif line.table == "reconstructions" and not (
+            columns.get("finished_at")
+            and any(self._store.list(reconstruction_prefix(columns["id"])))
+        ):
+            return None  # its job begins another one, or it was deleted: see whitenings
         elif line.table == "generations":
             if columns["whitening_id"] not in self._ids["whitenings"]:
                 columns["whitening_id"] = None

@@ -51,6 +51,7 @@ PHOTO_COLUMNS = (
     Photo.filename,
     Photo.latitude,
     Photo.longitude,
+    Photo.altitude,
     Photo.heading,
     Photo.captured_at,
     Photo.place,

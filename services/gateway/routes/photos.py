@@ -47,6 +47,7 @@ from shared.catalog.maps import get_map, increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole, get_photo, mark_photo_deleted
 from shared.errors import NotFound, invalid_field_error
 from shared.imaging.file_formats import needs_preview
+from shared.imaging.photo_header import MAX_ALTITUDE_M
 from shared.ingest.photo_metadata import (
     check_coordinate_pair,
     check_metadata,
@@ -79,6 +80,9 @@ class PhotoUpdate(RequestModel):
 
     latitude: Annotated[float | None, Field(ge=-90, le=90, allow_inf_nan=False)] = None
     longitude: Annotated[float | None, Field(ge=-180, le=180, allow_inf_nan=False)] = None
+    altitude: Annotated[
+        float | None, Field(ge=-MAX_ALTITUDE_M, le=MAX_ALTITUDE_M, allow_inf_nan=False)
+    ] = None
     heading: Annotated[float | None, Field(ge=0, le=360, allow_inf_nan=False)] = None
     captured_at: str | None = None
     place: Annotated[str | None, Field(max_length=500, pattern=NO_NUL_PATTERN)] = None

@@ -29,6 +29,7 @@ from services.gateway.uploads.multipart import FormFile, multipart_schema, recei
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.photos import PhotoRole
 from shared.imaging.file_formats import ACCEPTED_PHOTOS, photo_suffix
+from shared.imaging.photo_header import MAX_ALTITUDE_M
 from shared.ingest.store_photo import StoreResult, insert_photo
 from shared.ingest.validation import check_photo_signature, validate_photo
 from shared.jobs import Job, JobState
@@ -41,6 +42,12 @@ UPLOAD_FORM = multipart_schema(
     ACCEPTED_PHOTOS,
     latitude={"type": "number", "minimum": -90, "maximum": 90},
     longitude={"type": "number", "minimum": -180, "maximum": 180},
+    altitude={
+        "type": "number",
+        "minimum": -MAX_ALTITUDE_M,
+        "maximum": MAX_ALTITUDE_M,
+        "description": "metres",
+    },
     heading={"type": "number", "minimum": 0, "maximum": 360},
     captured_at={"type": "string", "format": "date-time"},
     place={**_TEXT_SCHEMA, "description": "a label, for places without useful coordinates"},

@@ -21,6 +21,7 @@ from services.steward.tasks.garbage_collection import (
     delete_chunks,
     delete_presigned_uploads,
     delete_queries,
+    delete_reconstructions,
     delete_with_objects,
     deletion_is_journaled,
     journal_deletions,
@@ -31,9 +32,10 @@ from shared.catalog.chunks import Descriptor
 from shared.catalog.database.base import affected_rows, is_journaled
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Evaluation, Generation
-from shared.catalog.jobs import Job, JobKind
+from shared.catalog.jobs import UPLOAD_JOBS, Job, JobKind
 from shared.catalog.maps import CachedMapStatistics, Map, Search
 from shared.catalog.photos import Photo, PresignedUpload
+from shared.catalog.reconstructions import Reconstruction
 from shared.catalog.tracks import Track, delete_tracks
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.jobs.transitions import cancel_jobs
@@ -68,6 +70,7 @@ def _purge_next(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
         _purge_chunks,
         _purge_queries,
         _purge_batches,
+        _purge_reconstructions,
         _purge_photos,
         _purge_presigned_uploads,
         _purge_searches,
@@ -142,6 +145,11 @@ def _purge_photos(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     return delete_with_objects(catalog, store, photos, object_keys, delete_rows)
 
 
+def _purge_reconstructions(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+    of_map = select(Reconstruction).where(Reconstruction.map_id == map_id)
+    return delete_reconstructions(catalog, store, of_map)
+
+
 def _purge_presigned_uploads(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     return delete_presigned_uploads(catalog, store, PresignedUpload.map_id == map_id)
 
@@ -161,7 +169,7 @@ def _purge_tracks(catalog: Catalog, _store: ObjectStore, map_id: UUID) -> bool:
 
 
 def _purge_vocabulary_objects(catalog: Catalog, store: ObjectStore, map_id: UUID) -> None:
-    """Delete the objects of vocabularies, imports, whitenings and uploaded checkpoints.
+    """Delete the objects of vocabularies, imports, whitenings and uploads of UPLOAD_JOBS.
 
     Imports may have an object without a vocabulary row. The few rows are deleted by the caller.
     """
@@ -171,10 +179,10 @@ def _purge_vocabulary_objects(catalog: Catalog, store: ObjectStore, map_id: UUID
         )
         imports = session.scalars(
             select(Job.params).where(
-                Job.map_id == map_id, Job.kind.in_((JobKind.IMPORT, JobKind.ADD_MODEL))
+                Job.map_id == map_id, Job.kind.in_((JobKind.IMPORT, *UPLOAD_JOBS))
             )
         )
-        keys += [params["object_key"] for params in imports]
+        keys += [key for params in imports if (key := params["object_key"]) is not None]
         keys += session.scalars(
             select(StoredWhitening.object_key).where(StoredWhitening.map_id == map_id)
         )

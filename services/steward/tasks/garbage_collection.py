@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar
 
 from sqlalchemy import Select, and_, delete, exists, or_, select, update
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, aliased
 
 from services.steward.periodic_tasks import periodic_task
 from services.steward.tasks.reindex_jobs import delete_done_reindex_jobs, settle_photo_jobs
@@ -24,9 +24,10 @@ from shared.catalog.chunks import Chunk, Descriptor, delete_chunk_rows
 from shared.catalog.database.base import Condition, db_now, db_now_plus, is_journaled
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.jobs import QUERY_TTL_SECONDS, UNFINISHED_STATES, Job, JobKind
+from shared.catalog.jobs import QUERY_TTL_SECONDS, UNFINISHED_STATES, UPLOAD_JOBS, Job, JobKind
 from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.photos import Photo, PresignedUpload
+from shared.catalog.reconstructions import Reconstruction
 from shared.catalog.tracks import TrackFrame, is_pending
 from shared.catalog.vocabularies import StoredWhitening
 from shared.errors import Unavailable
@@ -173,6 +174,44 @@ def collect_whitenings(catalog: Catalog, store: ObjectStore, grace_seconds: floa
     )
 
 
+def collect_reconstructions(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
+    """Delete reconstructions that were replaced `grace_seconds` ago, or whose job ended without it.
+
+    One of other local features stays: the map may switch back to them.
+    """
+    newer, long_ago = aliased(Reconstruction), db_now_plus(-grace_seconds)
+    was_replaced = exists().where(
+        newer.map_id == Reconstruction.map_id,
+        newer.features_model == Reconstruction.features_model,
+        newer.id > Reconstruction.id,
+        newer.finished_at < long_ago,
+    )
+    may_continue = exists().where(
+        Job.id == Reconstruction.job_id,
+        or_(Job.state.in_(UNFINISHED_STATES), Job.finished_at >= long_ago),
+    )
+    is_finished = Reconstruction.finished_at.is_not(None)
+    over = select(Reconstruction).where(
+        or_(and_(is_finished, was_replaced), and_(~is_finished, ~may_continue))
+    )
+    delete_reconstructions(catalog, store, over)
+
+
+def delete_reconstructions(
+    catalog: Catalog, store: ObjectStore, selected: Select[Reconstruction]
+) -> bool:
+    """Delete the selected reconstructions with their objects; return whether there were any."""
+    return delete_with_objects(
+        catalog,
+        store,
+        selected.limit(ROWS_PER_TRANSACTION),
+        lambda reconstruction: reconstruction.list_object_keys(store),
+        lambda session, rows: session.execute(
+            delete(Reconstruction).where(Reconstruction.id.in_(row.id for row in rows))
+        ),
+    )
+
+
 def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
     """Delete the objects of deleted photos at once, and their rows after `grace_seconds`.
 
@@ -276,7 +315,7 @@ def collect_presigned_uploads(catalog: Catalog, store: ObjectStore) -> None:
 
 
 def collect_checkpoints(catalog: Catalog, store: ObjectStore) -> None:
-    """Delete uploaded checkpoints whose jobs have ended.
+    """Delete uploaded checkpoints and COLMAP models whose jobs have ended.
 
     A checkpoint that no job refers to stays: its upload may still be running.
     """
@@ -285,9 +324,7 @@ def collect_checkpoints(catalog: Catalog, store: ObjectStore) -> None:
         return
     with catalog.read() as session:
         ended = session.scalars(
-            select(Job.params).where(
-                Job.kind == JobKind.ADD_MODEL, Job.state.not_in(UNFINISHED_STATES)
-            )
+            select(Job.params).where(Job.kind.in_(UPLOAD_JOBS), Job.state.not_in(UNFINISHED_STATES))
         )
         ended_keys = {params["object_key"] for params in ended}
     for key in keys:
@@ -310,6 +347,7 @@ def collect_garbage(
     collect_superseded_chunks(catalog, store, superseded_grace_seconds)
     collect_ended_generations(catalog, store, retired_grace_seconds)
     collect_whitenings(catalog, store, retired_grace_seconds)
+    collect_reconstructions(catalog, store, retired_grace_seconds)
     collect_deleted_photos(catalog, store, retired_grace_seconds)
     collect_queries(catalog, store, query_ttl_seconds)
     collect_presigned_uploads(catalog, store)

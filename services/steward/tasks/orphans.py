@@ -26,9 +26,10 @@ from shared.catalog.chunks import Chunk
 from shared.catalog.database.base import db_now
 from shared.catalog.database.session import Catalog
 from shared.catalog.installation import check_not_behind
-from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState
+from shared.catalog.jobs import UNFINISHED_STATES, UPLOAD_JOBS, Job, JobKind, JobState
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo, PresignedUpload
+from shared.catalog.reconstructions import Reconstruction
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.errors import Conflict
 from shared.storage import ObjectStore, OwnedStore
@@ -40,6 +41,7 @@ from shared.storage.keys import (
     ORIGINALS,
     PREVIEWS,
     QUERIES,
+    RECONSTRUCTIONS,
     THUMBNAILS,
     TRASH,
     VOCABULARIES,
@@ -231,11 +233,11 @@ def _referenced_originals(session: Session, keys: list[str]) -> Iterable[str]:
 
 
 def _referenced_checkpoints(session: Session, keys: list[str]) -> Iterable[str]:
-    """Keys of checkpoints whose jobs are unfinished."""
+    """Keys of checkpoints and COLMAP models whose jobs are unfinished."""
     unfinished = session.scalars(
-        select(Job.params).where(Job.kind == JobKind.ADD_MODEL, Job.state.in_(UNFINISHED_STATES))
+        select(Job.params).where(Job.kind.in_(UPLOAD_JOBS), Job.state.in_(UNFINISHED_STATES))
     )
-    return [params["object_key"] for params in unfinished]
+    return [key for params in unfinished if (key := params["object_key"]) is not None]
 
 
 def _referenced_incoming(session: Session, keys: list[str]) -> Iterable[str]:
@@ -288,6 +290,13 @@ def _referenced_queries(session: Session, keys: list[str]) -> Iterable[str]:
     return [key for job_id in stored for key in query_object_keys(job_id)]
 
 
+def _referenced_reconstructions(session: Session, keys: list[str]) -> Iterable[str]:
+    ids_of_keys = {key: _parse_uuids([key.split("/")[1]]) for key in keys}
+    ids = set().union(*ids_of_keys.values())
+    stored = set(session.scalars(select(Reconstruction.id).where(Reconstruction.id.in_(ids))))
+    return [key for key, of_key in ids_of_keys.items() if of_key & stored]
+
+
 def _parse_uuids(names: Iterable[str]) -> set[UUID]:
     """Return the names that are UUIDs; an object with another name belongs to no row."""
     ids = set()
@@ -309,4 +318,5 @@ REFERENCED_BY_PREFIX: dict[str, Callable[[Session, list[str]], Iterable[str]]] =
     VOCABULARIES: _referenced_vocabularies,
     WHITENINGS: _referenced_by_column(StoredWhitening.object_key),
     QUERIES: _referenced_queries,
+    RECONSTRUCTIONS: _referenced_reconstructions,
 }

@@ -24,16 +24,17 @@ from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
-from shared.catalog.generations import Generation
+from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import cache_map_statistics
 from shared.catalog.photos import Photo, PresignedUpload
 from shared.config.settings import Settings
 from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.jobs import InProcessWakeups, Job, JobKind
 from shared.storage import FolderStore
+from shared.storage.keys import new_checkpoint_key
 from tests.integration.gateway.deleted_maps import ROUNDS, id_of, objects, remove_all, rows
 from tests.integration.in_process_api import Service
-from tests.support.catalog_rows import add_photo
+from tests.support.catalog_rows import add_job, add_photo, add_reconstruction
 from tests.support.checkpoints import none_added
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
@@ -86,8 +87,16 @@ def live_in(service: Service, name: str) -> None:
     service.upload(photo_bytes(6), name)
     files = {"file": ("batch.jpg", photo_bytes(7))}
     service.json("POST", "/upload/batch", 202, params=params, files=files)
-    with service.catalog.write() as session:  # which takes a bucket otherwise
-        session.add(
+    with service.catalog.write() as session:
+        active = active_generation(session, id_of(service, name))
+        assert active is not None
+        job = add_job(
+            session, active.map_id, JobKind.RECONSTRUCT, params={"object_key": new_checkpoint_key()}
+        )
+        made = add_reconstruction(session, service.store, active)
+        made.job_id, made.finished_at = job.id, None
+        service.store.put(job.params["object_key"], b"a COLMAP model")
+        session.add(  # which takes a bucket otherwise
             PresignedUpload(
                 map_id=id_of(service, name),
                 filename="sent.jpg",
@@ -172,6 +181,7 @@ def test_a_deleted_map_leaves_no_row_and_no_byte_and_others_stay(
     }
     assert all(during[table] > before[0][table] for table in during.keys() - of_no_map), during
     kinds = {"originals", "thumbnails", "chunks", "queries", "vocabularies", "whitenings", "work"}
+    kinds |= {"checkpoints", "reconstructions"}
     assert kinds >= {key.split("/")[0] for key in objects(store) - before[1]}
     service.json("DELETE", "/maps/gone")
     problem(service("GET", "/maps/gone"), 404, "map_not_found")

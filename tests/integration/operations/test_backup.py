@@ -18,6 +18,7 @@ from services.extractor.worker import ExtractorWorker
 from shared.catalog.api_keys import authenticate_api_key, create_api_key
 from shared.catalog.chunks import Chunk
 from shared.catalog.database.session import Catalog
+from shared.catalog.generations import active_generation
 from shared.catalog.installation import check_not_behind, get_or_create_installation
 from shared.catalog.jobs import Job, JobKind, JobState
 from shared.catalog.maps import get_map
@@ -32,7 +33,7 @@ from shared.security.api_keys import Scope, hash_api_key
 from shared.storage import FolderStore
 from shared.storage.keys import JOURNAL, thumbnail_key
 from tests.integration.in_process_api import Service
-from tests.support.catalog_rows import take
+from tests.support.catalog_rows import add_reconstruction, take
 from tests.support.photos import photo_bytes
 from tests.support.servers import PostgresServer
 
@@ -148,6 +149,9 @@ def test_a_backup_goes_from_either_database_into_the_other_and_answers_the_same(
         fit = start_model_change(session, default, JobKind.FIT, {"clusters": 2}).id
         session.get_one(Job, UUID(failed)).state = JobState.FAILED
         _, key = create_api_key(session, "theirs", {Scope.READ})
+        active = active_generation(session, default)
+        assert active is not None
+        add_reconstruction(session, service.store, active)
     (held,) = (str(job.id) for job in take(service.catalog, 1))
     query = service.ask(photo_bytes(7))
     manifest = back_up()

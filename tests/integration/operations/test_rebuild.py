@@ -34,6 +34,7 @@ from shared.catalog.installation import (
 from shared.catalog.jobs import Job, JobKind
 from shared.catalog.maps import Map, get_or_create_default_map
 from shared.catalog.photos import Photo
+from shared.catalog.reconstructions import Reconstruction
 from shared.config.settings import Settings
 from shared.errors import Conflict, Misconfigured, StorageFull
 from shared.integrity.verify import verify_store
@@ -46,7 +47,7 @@ from shared.storage.keys import JOURNAL, ORIGINALS
 from shared.storage.ownership import read_owner
 from shared.storage.segments import list_segments
 from tests.integration.in_process_api import Service
-from tests.support.catalog_rows import add_job, stored_rows
+from tests.support.catalog_rows import add_job, add_reconstruction, stored_rows
 from tests.support.photos import photo_bytes
 
 # tests/faults/test_rebuild_catalog.py does the same on SQLite.
@@ -153,6 +154,25 @@ def test_every_photo_is_searchable_again_with_its_metadata(
     assert write_journal(service.catalog, store) > 0
     assert collect_orphans(service.catalog, store, -1.0) > 0  # the deleted photo's and map's
     assert verify_store(service.catalog, store, originals=True).faults == []
+
+
+def test_a_finished_reconstruction_comes_back_and_one_that_was_deleted_does_not(
+    service: Service, store: FolderStore
+) -> None:
+    service.indexed(1)
+    with service.catalog.write() as session:
+        generation = session.scalars(select(Generation)).one()
+        kept = add_reconstruction(session, store, generation)
+        add_reconstruction(session, store, generation, finished_at=None)
+        deleted = add_reconstruction(session, store, generation)
+    write_journal(service.catalog, store)
+    for key in deleted.list_object_keys(store):
+        store.delete(key)
+    lose_catalog(service.catalog)
+    service, _ = rebuilt(service)
+    with service.catalog.read() as session:
+        found = session.scalars(select(Reconstruction)).one()
+        assert (found.id, found.list_components()) == (kept.id, kept.list_components())
 
 
 def test_a_map_with_float16_rows_goes_on_with_them(service: Service, store: FolderStore) -> None:

@@ -11,6 +11,7 @@ from sqlalchemy import delete, func, select
 
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.base import Base
+from shared.catalog.generations import Generation
 from shared.catalog.maps import Map, mark_map_deleted
 from shared.catalog.photos import Photo
 from shared.integrity.verify import IntegrityReport, repair_descriptors, verify_store
@@ -18,6 +19,7 @@ from shared.jobs import InProcessWakeups
 from shared.storage.chunks import features_key, manifest_key
 from tests.integration.in_process_api import Service
 from tests.integration.workplace import Workplace
+from tests.support.catalog_rows import add_reconstruction
 
 # tests/e2e/test_backup_and_verify.py does the same on SQLite.
 pytestmark = pytest.mark.databases("postgresql")
@@ -201,6 +203,22 @@ def test_a_vocabulary_that_is_deleted_while_it_is_verified_is_no_fault(
 
     monkeypatch.setattr(vlads.store, "head", delete_the_map_after)
     assert verify_store(vlads.catalog, vlads.store, originals=False).faults == []
+
+
+@pytest.mark.parametrize("damage", ["changed", "missing"])
+def test_damaged_reconstructions_are_found(service: Service, damage: str) -> None:
+    service.indexed(1)
+    with service.catalog.write() as session:
+        generation = session.scalars(select(Generation)).one()
+        made = add_reconstruction(session, service.store, generation)
+        (component,) = made.list_components()
+    assert looked(service).faults == []
+    if damage == "changed":
+        service.store.put(component.object_key, b"other bytes")
+    else:
+        service.store.delete(component.object_key)
+    expected = "damaged" if damage == "changed" else "missing"
+    assert faults(looked(service)) == {(expected, "reconstruction")}
 
 
 def test_every_table_that_names_objects_is_looked_at() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime, timedelta
 from typing import Any
 from uuid import UUID
 
@@ -12,13 +13,15 @@ from services.steward.tasks.garbage_collection import (
     collect_deleted_photos,
     collect_ended_generations,
     collect_queries,
+    collect_reconstructions,
     collect_superseded_chunks,
 )
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.photos import Photo, get_photo
-from shared.jobs import Job, JobKind
+from shared.catalog.reconstructions import Reconstruction
+from shared.jobs import Job, JobKind, JobState
 from shared.storage import FolderStore
 from shared.storage.keys import (
     preview_key,
@@ -28,7 +31,15 @@ from shared.storage.keys import (
 )
 from tests.integration.steward.chunk_map import HOUR_SECONDS, ChunkMap
 from tests.integration.steward.test_compaction import sum_of
-from tests.support.catalog_rows import add_chunk, add_generation, add_job, ask, stored_rows, upload
+from tests.support.catalog_rows import (
+    add_chunk,
+    add_generation,
+    add_job,
+    add_reconstruction,
+    ask,
+    stored_rows,
+    upload,
+)
 
 
 def test_superseded_chunks_go_after_the_grace_and_not_before(chunk_map: ChunkMap) -> None:
@@ -48,6 +59,36 @@ def test_superseded_chunks_go_after_the_grace_and_not_before(chunk_map: ChunkMap
     with chunk_map.catalog.read() as session:
         assert session.scalar(select(func.count()).select_from(Chunk)) == 1
     chunk_map.check_rows(photo_ids)
+
+
+def test_reconstructions_that_were_replaced_or_given_up_go_after_the_grace(
+    chunk_map: ChunkMap,
+) -> None:
+    long_ago = datetime.now(UTC) - timedelta(seconds=HOUR_SECONDS + 60)
+
+    def add(**columns: Any) -> UUID:
+        generation = session.get_one(Generation, chunk_map.generation_id)
+        return add_reconstruction(session, chunk_map.store, generation, **columns).id
+
+    with chunk_map.catalog.write() as session:
+        job = add_job(session, chunk_map.map_id, JobKind.RECONSTRUCT, params={"object_key": None})
+        failed, failed_long_ago = (
+            add_job(session, job.map_id, JobKind.RECONSTRUCT, state=JobState.FAILED, finished_at=at)
+            for at in (datetime.now(UTC), long_ago)
+        )
+        replaced = add(finished_at=long_ago)
+        of_other_features = add(features_model="aliked@1", finished_at=long_ago)
+        last_but_one, last = add(finished_at=long_ago), add()
+        running, retried, given_up = (
+            add(finished_at=None, job_id=one.id) for one in (job, failed, failed_long_ago)
+        )
+    collect_reconstructions(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
+    remaining = {of_other_features, last_but_one, last, running, retried}
+    with chunk_map.catalog.read() as session:
+        assert set(session.scalars(select(Reconstruction.id))) == remaining
+    in_store = {UUID(key.split("/")[1]) for key in chunk_map.objects("reconstructions/")}
+    assert in_store == remaining
+    assert not remaining & {replaced, given_up}
 
 
 def test_ended_generations_lose_their_chunks_after_the_grace_and_not_before(

@@ -18,6 +18,7 @@ from services.steward.tasks.orphans import (
     collect_orphans,
     empty_expired_trash,
 )
+from shared.catalog.generations import Generation
 from shared.catalog.installation import adopt_store, get_or_create_installation
 from shared.catalog.photos import Photo
 from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin
@@ -27,7 +28,9 @@ from shared.ids import new_id
 from shared.jobs import InProcessWakeups, Job, JobKind, JobState
 from shared.journal.outbox import write_journal
 from shared.storage.keys import (
+    component_key,
     key_before_trash,
+    new_checkpoint_key,
     new_original_key,
     new_vocabulary_key,
     preview_key,
@@ -37,7 +40,7 @@ from shared.storage.keys import (
 )
 from shared.storage.trash import Hold, HoldReason, read_hold, restore_trash, write_hold
 from tests.integration.steward.chunk_map import DAY_SECONDS, ChunkMap
-from tests.support.catalog_rows import add_chunk, add_job, ask, upload
+from tests.support.catalog_rows import add_chunk, add_job, add_reconstruction, ask, upload
 
 
 def put_orphans(chunk_map: ChunkMap, *keys: str) -> None:
@@ -63,6 +66,8 @@ def test_old_orphans_of_every_prefix_go_and_what_is_referred_to_stays(chunk_map:
         new_vocabulary_key(),
         query_key(new_id()),
         query_vector_key(new_id()),
+        component_key(new_id(), 0),
+        new_checkpoint_key(),
     }
     for key in orphans:
         chunk_map.store.put(key, b"orphan")
@@ -100,6 +105,12 @@ def _live_objects(chunk_map: ChunkMap) -> set[str]:
             )
         )
         add_job(session, chunk_map.map_id, JobKind.IMPORT, params={"object_key": waiting})
+        model = new_checkpoint_key()
+        chunk_map.store.put(model, b"a COLMAP model")
+        add_job(session, chunk_map.map_id, JobKind.RECONSTRUCT, params={"object_key": model})
+        add_job(session, chunk_map.map_id, JobKind.RECONSTRUCT, params={"object_key": None})
+        generation = session.get_one(Generation, chunk_map.generation_id)
+        add_reconstruction(session, chunk_map.store, generation)
     return chunk_map.objects()
 
 
@@ -217,8 +228,8 @@ def test_an_orphan_goes_once_no_row_refers_to_it_any_more(chunk_map: ChunkMap) -
     live = _live_objects(chunk_map)
     chunk_map.age(live, 2 * DAY_SECONDS)
     with chunk_map.catalog.write() as session:
-        session.execute(update(Job).values(state=JobState.FAILED))  # the import, too
-    assert collect(chunk_map) == 1
+        session.execute(update(Job).values(state=JobState.FAILED))  # the uploads, too
+    assert collect(chunk_map) == 2
     assert len(chunk_map.objects("vocabularies/")) == 1
     with chunk_map.catalog.read() as session:
         photo_id = session.scalars(select(Photo.id)).one()

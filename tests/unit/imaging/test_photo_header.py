@@ -219,6 +219,43 @@ def test_broken_exif_is_ignored(exif: bytes) -> None:
     assert header(encoded(exif=exif)) == PhotoHeader(width=64, height=48)
 
 
+@pytest.mark.parametrize(
+    ("tags", "metres"),
+    [
+        ({GPS.GPSAltitude: 238.5, GPS.GPSAltitudeRef: b"\0"}, 238.5),
+        ({GPS.GPSAltitude: 238.5}, 238.5),
+        ({GPS.GPSAltitude: 12.25, GPS.GPSAltitudeRef: b"\1"}, -12.25),
+        ({GPS.GPSAltitude: 12.25, GPS.GPSAltitudeRef: b"\3"}, -12.25),
+        ({GPS.GPSAltitude: 4e8}, None),
+        ({GPS.GPSAltitudeRef: b"\0"}, None),
+    ],
+)
+def test_altitude_is_negative_below_the_sea(tags: Tags, metres: float | None) -> None:
+    found = header(encoded(exif=exif_with(tags)))
+    assert found.altitude == (None if metres is None else pytest.approx(metres))
+
+
+SENSOR = {Base.FocalLength: 4.0, Base.FocalPlaneXResolution: 5000.0}
+
+
+@pytest.mark.parametrize(
+    ("tags", "multiple"),
+    [
+        ({Base.FocalLengthIn35mmFilm: 27}, 0.75),
+        ({Base.FocalLengthIn35mmFilm: 27, **SENSOR}, 0.75),
+        ({Base.FocalLengthIn35mmFilm: 0}, None),
+        ({Base.FocalLength: 4.0}, None),
+        ({**SENSOR, Base.ExifImageWidth: 600, Base.ExifImageHeight: 800}, 4 / 25.4 * 5000 / 800),
+        ({**SENSOR, Base.FocalPlaneResolutionUnit: 3}, 4 / 10 * 5000 / 64),
+        ({**SENSOR, Base.FocalPlaneResolutionUnit: 9}, None),
+        ({Base.FocalLengthIn35mmFilm: 65_000}, None),
+    ],
+)
+def test_focal_length_is_a_multiple_of_the_longer_side(tags: Tags, multiple: float | None) -> None:
+    found = header(encoded(exif=exif_with(camera=tags)))
+    assert found.focal_length == (None if multiple is None else pytest.approx(multiple))
+
+
 def whole_exif() -> bytes:
     everything: Tags = {**position("N", "E"), **GPS_TIME, GPS.GPSImgDirection: 12.5}
     data: bytes = exif_with(

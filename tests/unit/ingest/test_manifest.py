@@ -27,13 +27,13 @@ def test_lines_give_the_forms_fields_by_the_photos_names() -> None:
         b"\xef\xbb\xbf"
         b'{"filename": "a.jpg", "latitude": 45.5, "longitude": -7, "tags": ["x", "y"]}\n'
         b"\n"
-        b'{"path": "in/b.jpg", "place": "h\xc3\xa4ll", "metadata": {"n": [1]}, "heading": null}\r\n'
-        b'{"file": "c.jpg", "captured_at": "2026-05-01", "role": "query"}'
+        b'{"path": "in/b.jpg", "place": "h\xc3\xa4ll", "metadata": {"n": [1]}, "altitude": 3}\r\n'
+        b'{"file": "c.jpg", "captured_at": "2026-05-01", "role": "query", "heading": null}'
     )
     reported = read_jsonl_manifest(data, "the manifest")
     assert reported == [
         ManifestEntry(1, "a.jpg", {"latitude": "45.5", "longitude": "-7", "tags": "x,y"}),
-        ManifestEntry(3, "in/b.jpg", {"place": "häll", "metadata": '{"n": [1]}'}),
+        ManifestEntry(3, "in/b.jpg", {"place": "häll", "metadata": '{"n": [1]}', "altitude": "3"}),
         ManifestEntry(4, "c.jpg", {"captured_at": "2026-05-01", "role": "query"}),
     ]
     fields = [read_form_fields(one.fields) for one in reported]

@@ -34,6 +34,7 @@ def test_every_field_is_read() -> None:
         {
             "latitude": " 45.07 ",
             "longitude": "-7.5",
+            "altitude": "-3.5",
             "heading": "90",
             "captured_at": "2026-05-01T12:30:00+02:00",
             "place": "corridor 3",
@@ -45,6 +46,7 @@ def test_every_field_is_read() -> None:
     assert found == PhotoFields(
         latitude=45.07,
         longitude=-7.5,
+        altitude=-3.5,
         heading=90.0,
         captured_at=datetime(2026, 5, 1, 10, 30, tzinfo=UTC),
         place="corridor 3",

@@ -1,0 +1,125 @@
+"""Reconstructions: COLMAP models of a map's photos, by which a query's pose is computed.
+
+The objects are under `reconstruction_prefix(id)` (`shared.storage.keys`). A job continues its row
+until `finished_at` is set; from then on the row does not change.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+from uuid import UUID
+
+import sqlalchemy as sa
+from pydantic import BaseModel, ConfigDict
+from sqlalchemy.orm import Mapped, Session, mapped_column
+
+from shared.catalog.chunks import find_features_model
+from shared.catalog.database.base import Base, Journaled, JsonValue, UtcDateTime, db_now
+from shared.catalog.generations import active_generation
+from shared.ids import new_id
+from shared.storage import ObjectStore
+from shared.storage.keys import reconstruction_prefix
+
+
+class ComponentAlignment(BaseModel):
+    """A similarity from a component's frame to east, north, up in metres, and its error."""
+
+    model_config = ConfigDict(frozen=True)
+
+    origin: tuple[float, float, float]
+    """latitude and longitude in degrees, altitude in metres: where east, north and up are 0"""
+    scale: float
+    """metres per unit of the component"""
+    rotation: tuple[float, float, float, float]
+    """unit quaternion (w, x, y, z)"""
+    translation: tuple[float, float, float]
+    """metres"""
+    covariance: list[list[float]]
+    """(7, 7), as `shared.geometry.frames.Similarity` has it"""
+    rms_m: float
+    """root of the mean squared distance of the photos' coordinates from the model"""
+
+
+class ReconstructedComponent(BaseModel):
+    """A component: photos and points in one frame. No two components share a photo."""
+
+    model_config = ConfigDict(frozen=True)
+
+    number: int
+    """from 0"""
+    object_key: str
+    """of its `shared.geometry.component.Component`"""
+    sha256: dict[str, str]
+    """SHA-256 of this object and of those of its COLMAP model, hexadecimal, by key"""
+    photos: int
+    points: int
+    mean_reprojection_error_pixels: float
+    alignment: ComponentAlignment | None = None
+    not_aligned: str | None = None
+    """why there is no alignment, as a sentence; None with one"""
+    calibration: dict[str, Any] | None = None
+    """a `shared.geometry.radius.PoseCalibration`; None if it could not be measured"""
+
+
+class Reconstruction(Journaled, Base):
+    """A reconstruction of a map's photos.
+
+    `features_model` is that of the local features that its points refer to: no query with features
+    of another model has a pose in it. `components` is None until they are stored, and then a list
+    of `ReconstructedComponent`, largest first; `proposals` lists other coordinates for photos that
+    disagree with the model.
+    """
+
+    __tablename__ = "reconstructions"
+
+    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
+    map_id: Mapped[UUID] = mapped_column(sa.Uuid, sa.ForeignKey("maps.id"))
+    job_id: Mapped[UUID] = mapped_column(sa.Uuid, index=True)
+    generation_id: Mapped[UUID] = mapped_column(
+        sa.Uuid, sa.ForeignKey("generations.id"), index=True
+    )
+    map_version: Mapped[int] = mapped_column(sa.BigInteger)
+    features_model: Mapped[str] = mapped_column(sa.String(100))
+    imported: Mapped[bool] = mapped_column(sa.Boolean, default=False)
+    """Whether its poses come from a model that was uploaded."""
+    components: Mapped[list[dict[str, Any]] | None] = mapped_column(JsonValue)
+    proposals: Mapped[list[dict[str, Any]]] = mapped_column(JsonValue, default=list)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
+    finished_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+
+    __table_args__ = (sa.Index("ix_reconstructions_map_id", "map_id", "id"),)
+
+    def list_components(self) -> list[ReconstructedComponent]:
+        """Return the components, largest first; empty until they are stored."""
+        return [ReconstructedComponent.model_validate(one) for one in self.components or ()]
+
+    def list_object_keys(self, store: ObjectStore) -> list[str]:
+        """Return the keys of all its objects, whether it is finished or not."""
+        return [info.key for info in store.list(reconstruction_prefix(self.id))]
+
+
+def current_reconstruction(session: Session, map_id: UUID) -> Reconstruction | str:
+    """Return the reconstruction for queries of the map now, or why there is none, as a sentence.
+
+    It is the newest finished one for the local features of the active generation.
+    """
+    finished = (
+        sa.select(Reconstruction)
+        .where(Reconstruction.map_id == map_id, Reconstruction.finished_at.is_not(None))
+        .order_by(Reconstruction.id.desc())
+        .limit(1)
+    )
+    active = active_generation(session, map_id)
+    model = None if active is None else find_features_model(session, active.id)
+    if model is not None:
+        current = session.scalar(finished.where(Reconstruction.features_model == model))
+        if current is not None:
+            return current
+    other = session.scalar(finished)
+    if other is None:
+        return "The map has no reconstruction yet. Make one: `placewise reconstruct`."
+    return (
+        f"The map's reconstruction is of local features of {other.features_model}, and the map now "
+        f"has {model or 'none'}. Make a new one: `placewise reconstruct`."
+    )
