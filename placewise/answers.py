@@ -488,13 +488,13 @@ class Stats(Answer):
 
 
 class AddedModel(Answer):
-    """A trained model that was added to the server; maps refer to it as `extractor`."""
+    """A model that was added to the server; maps refer to it as `extractor`."""
 
     name: str
     extractor: str
     fingerprint: str
     dimension: int
-    image_size: tuple[int, int]
+    image_size: tuple[int, int] | None
     config: dict[str, Any]
     size_bytes: int
     sha256: str

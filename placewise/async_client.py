@@ -525,17 +525,19 @@ class AsyncClient(AsyncTransport):
         checkpoint: str | Path,
         name: str,
         *,
+        options: str | None = None,
         licence: str | None = None,
         note: str | None = None,
         on_sent: Callable[[int], object] = lambda sent_bytes: None,
     ) -> answers.Started:
-        """Start adding a checkpoint of `placewise train` as an extractor.
+        """Start adding a checkpoint, TorchScript or ONNX file as an extractor.
 
         Args:
-            name: Permanent name; maps refer to it as `gsv:NAME`.
+            name: Permanent name; maps refer to it as `gsv:NAME`, `torchscript:NAME` or `onnx:NAME`.
+            options: Of a TorchScript or ONNX file: `input.size=288x288,aggregator=vlad`.
             on_sent: Called with the number of bytes sent so far.
         """
-        data = drop_none(name=name, licence=licence, note=note)
+        data = drop_none(name=name, options=options, licence=licence, note=note)
         with open_file(Path(checkpoint)) as file:
             files = {"file": (printable_name(Path(checkpoint)), ReadProgressFile(file, on_sent))}
             return answers.Started(**await self._call("POST", "/models", files=files, data=data))

@@ -1,9 +1,10 @@
-"""Added models: import of trained checkpoints, local file cache, and loading.
+"""Added models: import of trained checkpoints and exported networks, local file cache, loading.
 
-`import_checkpoint` turns an uploaded checkpoint into a model of the catalog, if it can be read and
-used safely. `AddedModelLoader` loads added models. `ModelFileCache` provides their files with
-verified hashes: a file-based object store is read in place; from a bucket, files are downloaded
-into a folder of at most MODEL_CACHE_BYTES, which the processes of this machine may share.
+`import_model` turns an uploaded checkpoint, TorchScript or ONNX file into a model of the catalog,
+if it can be read and used safely. `AddedModelLoader` loads added models. `ModelFileCache` provides
+their files with verified hashes: a file-based object store is read in place; from a bucket, files
+are downloaded into a folder of at most MODEL_CACHE_BYTES, which the processes of this machine may
+share.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.models import Model, get_model_for_loading, register_model
 from shared.config.private_files import make_private_folder
 from shared.config.settings import Settings
+from shared.descriptors.backbones import Backbone
+from shared.descriptors.backbones.exported import ExportedBackbone, exported_prefix
 from shared.descriptors.backbones.trained import TrainedBackbone
 from shared.descriptors.vpr_models.checkpoint import (
     Checkpoint,
@@ -34,7 +37,8 @@ from shared.descriptors.vpr_models.checkpoint import (
     read_model_file,
 )
 from shared.errors import NotFound, Unavailable, Unprocessable
-from shared.extractor_config.names import TRAINED_MODEL_PREFIX
+from shared.extractor_config.configs import ExtractorConfig, get_extractor_config
+from shared.extractor_config.names import TORCHSCRIPT_PREFIX, TRAINED_MODEL_PREFIX
 from shared.ids import new_id
 from shared.jobs import Job, JobKind
 from shared.jobs.leases import lock_leased_job
@@ -116,7 +120,7 @@ def _check_hash(actual: str, key: str, sha256: str) -> None:
         raise Unavailable(
             "model_corrupt",
             f"The model {key} is corrupt: its hash differs. Restore it from a "
-            "backup, or add the same checkpoint again under its name (POST /api/v1/models).",
+            "backup, or add the same file again under its name (POST /api/v1/models).",
         )
 
 
@@ -130,29 +134,39 @@ class AddedModelLoader:
 
     def __init__(self, catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
         self._catalog = catalog
+        self._settings = settings
         self._cache = ModelFileCache(store, model_cache_folder(settings), MODEL_CACHE_BYTES)
 
-    def load(self, name: str, device: torch.device) -> TrainedBackbone:
-        """Load the model `name` onto the device.
+    def load(self, config: ExtractorConfig, device: torch.device) -> Backbone:
+        """Load the added model of an extractor onto the device.
 
         Raises:
-            Misconfigured: `model_missing`.
+            Misconfigured: `model_missing`, `code_not_allowed`, `onnx_missing`.
+            Unprocessable: `model_unusable`, of an exported network with other options than those
+                that it was added with.
             Unavailable: `model_lost`, `model_corrupt`, `model_unreadable`, and as the store raises
                 it.
         """
+        (name,) = config.added_models
         with self._catalog.read() as session:
             row = get_model_for_loading(session, name)
         assert row.object_key is not None
         assert row.sha256 is not None
+        if name.prefix == TORCHSCRIPT_PREFIX:
+            self._settings.check_torchscript_allowed(row.name, row.sha256)
         try:
-            model = read_model_file(self._cache.local_path(row.object_key, row.sha256))
+            path = self._cache.local_path(row.object_key, row.sha256)
+            if config.input is not None:
+                data = path.read_bytes()
+                return ExportedBackbone(config, data, device, licence=row.licence, card=row.card)
+            model = read_model_file(path)
         except NotFound as error:
             raise Unavailable(
                 "model_lost",
-                f"The weights of the model {name!r} are missing from the object store "
-                f"({row.object_key}). Restore them from a backup, or add the same checkpoint again "
+                f"The weights of the model {row.name} are missing from the object store "
+                f"({row.object_key}). Restore them from a backup, or add the same file again "
                 "under its name.",
-                model=name,
+                model=row.added_name,
             ) from error
         return TrainedBackbone(
             row.name, model, row.fingerprint, device, licence=row.licence, card=row.card
@@ -160,22 +174,51 @@ class AddedModelLoader:
 
 
 @handles_model_change(JobKind.ADD_MODEL)
-def import_checkpoint(context: ExtractorContext, job: Job) -> None:
-    """Validate the checkpoint at `object_key`, store its model file, and add its catalog row.
+def import_model(context: ExtractorContext, job: Job) -> None:
+    """Validate the file at `object_key`, store its model file, and add its catalog row.
 
     A file without its row is deleted as an orphan.
 
     Raises:
         Unprocessable: As `load_checkpoint` raises it; `model_unusable`, `checkpoint_lost`.
+        Misconfigured: `code_not_allowed`, `onnx_missing`.
         Conflict: `model_name_taken`.
     """
     filename, name = job.params["filename"], job.params["name"]
     with _local_file(context, job.params["object_key"]) as path:
+        prefix = exported_prefix(path, filename)
         try:
-            checkpoint = load_checkpoint(path)
+            if prefix is None:
+                new, data = _read_trained(load_checkpoint(path), filename, name)
+            else:
+                new, data = _read_exported(context, job, prefix, path.read_bytes())
         except Unprocessable as error:  # its message names the temporary file
             detail = error.detail.replace(path.name, filename)
             raise Unprocessable(error.code, detail, **error.extra) from error
+    sha256 = hashlib.sha256(data).hexdigest()
+    new.id, new.added_name, new.added_at = new_id(), name, db_now()
+    new.object_key, new.sha256, new.size_bytes = new_model_key(sha256), sha256, len(data)
+    new.licence, new.note = job.params["licence"], job.params["note"]
+    context.store.put(new.object_key, data)
+    with context.catalog.write() as session:
+        if leased := lock_leased_job(session, job):
+            model, added = register_model(session, new)
+            assert model.config is not None
+            succeed_job(
+                leased,
+                {
+                    "name": model.added_name,
+                    "extractor": model.config.get("extractor", model.name),
+                    "fingerprint": model.fingerprint,
+                    "dimension": model.dimension,
+                    "size_bytes": model.size_bytes,
+                    "already_there": not added,
+                },
+            )
+
+
+def _read_trained(checkpoint: Checkpoint, filename: str, name: str) -> tuple[Model, bytes]:
+    """Return the row of a checkpoint's model and its model file, after checking the model."""
     card = {"source": filename, **training_card(checkpoint)}
     TrainedBackbone(
         f"{TRAINED_MODEL_PREFIX}{name}",
@@ -185,39 +228,40 @@ def import_checkpoint(context: ExtractorContext, job: Job) -> None:
         licence="",
         card=card,
     ).check()
-    data = encode_model_file(checkpoint)
-    sha256 = hashlib.sha256(data).hexdigest()
-    key = new_model_key(sha256)
     new = Model(
-        id=new_id(),
         name=f"{TRAINED_MODEL_PREFIX}{name}",
-        added_name=name,
-        added_at=db_now(),
         fingerprint=checkpoint.fingerprint,
-        object_key=key,
-        sha256=sha256,
-        size_bytes=len(data),
         dimension=checkpoint.model.dimension,
         config=checkpoint.config.model_dump(mode="json"),
-        licence=job.params["licence"],
-        note=job.params["note"],
         card=card,
     )
-    context.store.put(key, data)
-    with context.catalog.write() as session:
-        if leased := lock_leased_job(session, job):
-            model, added = register_model(session, new)
-            succeed_job(
-                leased,
-                {
-                    "name": model.added_name,
-                    "extractor": model.name,
-                    "fingerprint": model.fingerprint,
-                    "dimension": model.dimension,
-                    "size_bytes": model.size_bytes,
-                    "already_there": not added,
-                },
-            )
+    return new, encode_model_file(checkpoint)
+
+
+def _read_exported(
+    context: ExtractorContext, job: Job, prefix: str, data: bytes
+) -> tuple[Model, bytes]:
+    """Return the row of an exported network, and its file, after checking the network."""
+    options = job.params["options"]
+    name = f"{prefix}{job.params['name']}"
+    config = get_extractor_config(
+        f"{name}:{options}" if options else name, allow_test_extractors=False
+    )
+    card = {"source": job.params["filename"]}
+    sha256 = hashlib.sha256(data).hexdigest()
+    if prefix == TORCHSCRIPT_PREFIX:
+        context.settings.check_torchscript_allowed(name, sha256)
+    backbone = ExportedBackbone(config, data, torch.device("cpu"), card=card)
+    assert config.input is not None
+    size = config.input.height and [config.input.height, config.input.width]
+    new = Model(
+        name=name,
+        fingerprint=sha256,
+        dimension=backbone.width,
+        config={"extractor": config.name, "image_size": size},
+        card=card,
+    )
+    return new, data
 
 
 @contextlib.contextmanager

@@ -31,7 +31,7 @@ from shared.extractor_config.configs import ExtractorConfig
 from shared.matching.detectors import Detector, load_detector
 from shared.storage import ObjectStore
 
-LoadAddedModel = Callable[[str, torch.device], Backbone]
+LoadAddedModel = Callable[[ExtractorConfig, torch.device], Backbone]
 
 MAX_EXTRACTORS = 2  # a large backbone takes gigabytes of GPU memory
 MAX_VOCABULARIES = 16
@@ -147,14 +147,13 @@ class ModelRegistry:
             return Extractor(
                 config, self._device, precision=precision, backbone=shared_backbone, limit=limit
             )
-        added = config.trained.registered if config.trained else None
         started = time.perf_counter()
         extractor = Extractor(
             config,
             self._device,
             precision=precision,
             dino_weights=self._settings.dino_weights,
-            backbone=self._load_added(added, self._device) if added else None,
+            backbone=self._load_added(config, self._device) if config.added_models else None,
             limit=limit,
         )
         self._backbones[config.backbone_key] = extractor.backbone
@@ -228,10 +227,9 @@ def _ensure_model_row(session: Session, extractor: Extractor) -> Model:
         Misconfigured: `model_missing` if an added model has been removed meanwhile.
     """
     backbone = extractor.backbone
-    trained = extractor.config.trained
-    if trained is not None and trained.registered is not None:
+    for added in extractor.config.added_models:
         # Locked, because a generation that uses it is created in this transaction.
-        return get_model_for_loading(session, trained.registered, lock=True)
+        return get_model_for_loading(session, added, lock=True)
     return get_or_create_model(
         session, backbone.name, backbone.fingerprint, backbone.licence, backbone.card
     )

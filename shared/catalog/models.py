@@ -1,7 +1,8 @@
 """Model registry: the models that have described photos, and trained models that users added.
 
 The name of an added model is permanent: descriptors, manifests and caches refer to it as
-`gsv:NAME`, so NAME is never reused for other weights, even after the model is removed.
+`gsv:NAME`, or by the prefix of its format, so NAME is never reused for other weights, even after
+the model is removed.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from shared.catalog.database.base import (
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map
 from shared.errors import Conflict, Misconfigured, NotFound, PlacewiseError
-from shared.extractor_config.configs import ExtractorConfig
+from shared.extractor_config.configs import ExtractorConfig, get_extractor_config
+from shared.extractor_config.names import ModelName
 from shared.ids import new_id
 
 
@@ -33,8 +35,10 @@ class Model(Journaled, Base):
     """A set of weights. `card` has their source and licence.
 
     The columns from `added_name` on are those of an added model: its weights are a file of
-    `shared.descriptors.vpr_models.checkpoint` under `object_key`, with the hash `sha256`. A removed
-    model keeps its row, without `object_key`, to reserve its name.
+    `shared.descriptors.vpr_models.checkpoint`, or a TorchScript or ONNX file, under `object_key`,
+    with the hash `sha256`. Its `config` has the `image_size`, and of an exported network the name
+    of the `extractor` with the options that it was checked with. A removed model keeps its row,
+    without `object_key`, to reserve its name.
     """
 
     __tablename__ = "models"
@@ -102,6 +106,7 @@ def register_model(session: Session, new: Model) -> tuple[Model, bool]:
     existing.object_key = new.object_key
     existing.sha256 = new.sha256
     existing.size_bytes = new.size_bytes
+    existing.config, existing.dimension = new.config, new.dimension
     existing.licence = licence or existing.licence
     existing.note = new.note or existing.note
     if was_removed:
@@ -128,12 +133,12 @@ def get_registered_model(session: Session, name: str) -> Model:
 
 def check_model_registered(session: Session, config: ExtractorConfig) -> None:
     """Raise NotFound (`model_missing`) if the extractor uses a model that was not added."""
-    if config.trained is not None and config.trained.registered is not None:
-        get_registered_model(session, config.trained.registered)
+    for model in config.added_models:
+        _get_model(session, str(model.registered), NotFound, prefix=model.prefix)
 
 
-def get_model_for_loading(session: Session, name: str, *, lock: bool = False) -> Model:
-    """Return the added model of this name, for extractors.
+def get_model_for_loading(session: Session, model: ModelName, *, lock: bool = False) -> Model:
+    """Return an added model by its registered name, for extractors.
 
     Args:
         lock: Lock the row, so that the model can't be removed before the transaction ends.
@@ -141,7 +146,7 @@ def get_model_for_loading(session: Session, name: str, *, lock: bool = False) ->
     Raises:
         Misconfigured: `model_missing`, as for other missing weights.
     """
-    return _get_model(session, name, Misconfigured, lock=lock)
+    return _get_model(session, str(model.registered), Misconfigured, lock=lock, prefix=model.prefix)
 
 
 def remove_model(session: Session, name: str, new_map_extractor: str) -> Model:
@@ -162,7 +167,7 @@ def remove_model(session: Session, name: str, new_map_extractor: str) -> Model:
             model=name,
             maps=maps,
         )
-    if new_map_extractor == row.name:
+    if _uses(new_map_extractor, row):
         raise Conflict(
             "model_in_use",
             f"The model {name!r} is the extractor of new maps (EXTRACTOR). Set another one first.",
@@ -179,17 +184,27 @@ def list_maps_using_model(session: Session, model: Model) -> list[str]:
 
     A map uses it with its active generation, a generation that is being built, or its extractor.
     """
+    live = Map.deleted_at.is_(None)
     by_generation = (
-        sa.select(Map.name)
+        sa.select(Map.name, Generation.extractor)
         .join(Generation, Generation.map_id == Map.id)
         .where(
-            Map.deleted_at.is_(None),
-            Generation.model_id == model.id,
+            live,
+            Generation.extractor.contains(model.name, autoescape=True),
             Generation.state.in_((GenerationState.ACTIVE, GenerationState.BUILDING)),
         )
     )
-    by_extractor = sa.select(Map.name).where(Map.deleted_at.is_(None), Map.extractor == model.name)
-    return sorted({*session.scalars(by_generation), *session.scalars(by_extractor)})
+    by_extractor = sa.select(Map.name, Map.extractor).where(
+        live, Map.extractor.contains(model.name, autoescape=True)
+    )
+    rows = (*session.execute(by_generation), *session.execute(by_extractor))
+    return sorted({name for name, extractor in rows if _uses(extractor, model)})
+
+
+def _uses(extractor: str, model: Model) -> bool:
+    """Return whether an extractor computes its descriptors with an added model."""
+    config = get_extractor_config(extractor, allow_test_extractors=True)
+    return model.name in {used.extractor for used in config.added_models}
 
 
 def _select_model(name: str, *, lock: bool = False) -> sa.Select[Model]:
@@ -198,14 +213,19 @@ def _select_model(name: str, *, lock: bool = False) -> sa.Select[Model]:
 
 
 def _get_model(
-    session: Session, name: str, missing: type[PlacewiseError], *, lock: bool = False
+    session: Session,
+    name: str,
+    missing: type[PlacewiseError],
+    *,
+    lock: bool = False,
+    prefix: str = "",
 ) -> Model:
-    """Return the added model of this name; raise `missing` if there is none."""
+    """Return the added model of this name and kind; raise `missing` if there is none."""
     model = session.scalar(_select_model(name, lock=lock))
-    if model is None or model.object_key is None:
+    if model is None or model.object_key is None or not model.name.startswith(prefix):
         raise missing(
             "model_missing",
-            f"There is no model named {name!r}. Add it: `placewise models add CHECKPOINT --name "
+            f"There is no model named {prefix}{name}. Add it: `placewise models add FILE --name "
             f"{name}`, or POST /api/v1/models. GET /api/v1/models lists the added models.",
             model=name,
         )

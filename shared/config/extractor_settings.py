@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Literal, Self
 
@@ -15,7 +16,11 @@ from shared.extractor_config.configs import (
     add_extractor_options,
     get_extractor_config,
 )
-from shared.extractor_config.names import TORCHHUB_PREFIX, parse_torchhub_name
+from shared.extractor_config.names import (
+    TORCHHUB_PREFIX,
+    TORCHSCRIPT_PREFIX,
+    parse_torchhub_name,
+)
 
 EXTRACTORS_BY_DINO_MODEL = {
     name.replace("anyloc-", "dinov2_"): name
@@ -58,10 +63,11 @@ class ExtractorSettings(BaseSettings):
     allow_test_extractors: bool = Field(
         False, description="let maps use the tiny extractors that exist for tests"
     )
-    torchhub_allowed: str | None = Field(
+    code_allowed: str | None = Field(
         None,
-        description="torch.hub extractors that maps may use, whose code is executed: exact names, "
-        "separated by blanks: torchhub:OWNER/NAME@COMMIT:ENTRY; unset: none but EXTRACTOR",
+        description="code of others that is executed, separated by blanks: exact names of "
+        "torch.hub extractors, torchhub:OWNER/NAME@COMMIT:ENTRY, and TorchScript files, "
+        "torchscript:SHA256; unset: none but EXTRACTOR, if that is of torch.hub",
     )
     device: Literal["auto", "cpu", "cuda"] = Field(
         "auto", description="device of the extractor; auto: CUDA where it is available"
@@ -95,13 +101,16 @@ class ExtractorSettings(BaseSettings):
         "most 70 kB a photo) or aliked-n16 (132 kB; slower, better; needs the extra `lightglue`)",
     )
 
-    @field_validator("torchhub_allowed")
+    @field_validator("code_allowed")
     @classmethod
-    def _check_torchhub_entries(cls, value: str | None) -> str | None:
+    def _check_allowed_code(cls, value: str | None) -> str | None:
         for name in (value or "").split():
+            if re.fullmatch(TORCHSCRIPT_PREFIX + "[0-9a-f]{64}", name):
+                continue
             if not name.startswith(TORCHHUB_PREFIX):
                 raise ValueError(
-                    f"{name!r} is not a torch.hub extractor: its name begins with {TORCHHUB_PREFIX}"
+                    f"{name!r} is neither a torch.hub extractor, whose name begins with "
+                    f"{TORCHHUB_PREFIX}, nor {TORCHSCRIPT_PREFIX} and the SHA-256 of a file"
                 )
             try:
                 parse_torchhub_name(name)
@@ -193,25 +202,40 @@ class ExtractorSettings(BaseSettings):
         """Return the configuration of an extractor that this installation may load.
 
         Raises:
-            Misconfigured: as `get_extractor_config`; `torchhub_not_allowed` for torch.hub code
-                that TORCHHUB_ALLOWED does not list; `model_not_added` for a checkpoint file of
+            Misconfigured: as `get_extractor_config`; `code_not_allowed` for torch.hub code
+                that CODE_ALLOWED does not list; `model_not_added` for a checkpoint file of
                 one machine.
         """
         config = get_extractor_config(name, allow_test_extractors=self.allow_test_extractors)
         _check_extractor_is_shared(config)
         if config.hub is not None and config.name not in self.allowed_hub_extractors:
             raise Misconfigured(
-                "torchhub_not_allowed",
+                "code_not_allowed",
                 f"The extractor {config.name} executes code of {config.hub.source}, which is not "
-                "allowed here. To allow it, the operator adds that exact name to TORCHHUB_ALLOWED "
+                "allowed here. To allow it, the operator adds that exact name to CODE_ALLOWED "
                 "of the gateway and the extractors, and restarts them.",
             )
         return config
 
+    def check_torchscript_allowed(self, name: str, sha256: str) -> None:
+        """Raise Misconfigured (`code_not_allowed`) unless CODE_ALLOWED lists the file's hash."""
+        code = f"{TORCHSCRIPT_PREFIX}{sha256}"
+        if code not in (self.code_allowed or "").split():
+            raise Misconfigured(
+                "code_not_allowed",
+                f"The TorchScript file of {name} holds code, which is not allowed here. If you "
+                f"trust where the file comes from, add {code} to CODE_ALLOWED of the extractors, "
+                "restart them, and try again.",
+            )
+
     @property
     def allowed_hub_extractors(self) -> tuple[str, ...]:
         """Canonical names of the torch.hub extractors that may be loaded."""
-        allowed = [parse_torchhub_name(name).name for name in (self.torchhub_allowed or "").split()]
+        allowed = [
+            parse_torchhub_name(name).name
+            for name in (self.code_allowed or "").split()
+            if name.startswith(TORCHHUB_PREFIX)
+        ]
         configured = self.new_map_extractor
         if configured.startswith(TORCHHUB_PREFIX):
             allowed.append(configured)
@@ -220,10 +244,10 @@ class ExtractorSettings(BaseSettings):
 
 def _check_extractor_is_shared(config: ExtractorConfig) -> None:
     """Raise Misconfigured (`model_not_added`) for a checkpoint that is a file of one machine."""
-    if config.trained is not None and config.trained.file is not None:
+    if config.model is not None and config.model.file is not None:
         raise Misconfigured(
             "model_not_added",
-            f"{config.trained.file} is a file of one machine, but any extractor worker may "
+            f"{config.model.file} is a file of one machine, but any extractor worker may "
             "describe a map's photos. Add it with `placewise models add "
-            f"{config.trained.file} --name NAME`, and use gsv:NAME.",
+            f"{config.model.file} --name NAME`, and use {config.model.prefix}NAME.",
         )

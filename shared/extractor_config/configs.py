@@ -5,6 +5,7 @@
     get_extractor_config("anyloc-vitg14:preprocessing=paper480x640", ...)
     get_extractor_config("torchhub:/models/mine:my_entry", ...)
     get_extractor_config("gsv:night-walks", ...)
+    get_extractor_config("onnx:town:aggregator=vlad,input.size=288x384", ...)
 
 A name may carry options. In the canonical name, options are in alphabetical order and options with
 the extractor's default are left out, so that each configuration has one name wherever it is stored
@@ -23,12 +24,15 @@ from typing import Any
 
 from shared.errors import Misconfigured
 from shared.extractor_config.names import (
-    DEFAULT_INPUT_SIDE_PIXELS,
+    EXPORT_PREFIXES,
+    MAX_NAME_CHARACTERS,
     TORCHHUB_PREFIX,
+    ModelName,
+    NetworkInput,
     TorchHubEntry,
-    TrainedModelName,
+    parse_exported_name,
+    parse_model_name,
     parse_torchhub_name,
-    parse_trained_model_name,
 )
 from shared.extractor_config.names import TRAINED_MODEL_PREFIX as TRAINED_PREFIX
 
@@ -90,8 +94,10 @@ class ExtractorConfig:
     """
     hub: TorchHubEntry | None = None
     """The torch.hub entry that computes the descriptors, for `torchhub:` names."""
-    trained: TrainedModelName | None = None
-    """The trained model that computes the descriptors, for `gsv:` names."""
+    model: ModelName | None = None
+    """The model that computes the descriptors, for `gsv:`, `torchscript:` and `onnx:` names."""
+    input: NetworkInput | None = None
+    """What an exported network expects; None for other extractors."""
     for_tests: bool = False
     size: str | None = None
     """`WIDTHxHEIGHT` of a thumbnail; None for other extractors."""
@@ -114,7 +120,12 @@ class ExtractorConfig:
         return self.width * (self.clusters if self.needs_vocabulary else 1)
 
     @property
-    def backbone_key(self) -> tuple[int | str | TorchHubEntry | TrainedModelName | None, ...]:
+    def added_models(self) -> tuple[ModelName, ...]:
+        """The models that have to be added before the extractor can be used."""
+        return (self.model,) if self.model is not None and self.model.registered else ()
+
+    @property
+    def backbone_key(self) -> tuple[object, ...]:
         """Cache key of the backbone: configurations with an equal key can share a loaded one."""
         return (
             self.backbone,
@@ -123,7 +134,8 @@ class ExtractorConfig:
             self.facet,
             self.milliseconds,
             self.hub,
-            self.trained,
+            self.model,
+            self.input and (self.input, self.aggregator == "none"),
         )
 
 
@@ -233,12 +245,14 @@ def get_extractor_config(name: str, *, allow_test_extractors: bool) -> Extractor
     Raises:
         Misconfigured: `unknown_extractor`; `test_extractor` where extractors for tests are not
             allowed; `bad_extractor_option` with the option, its value and the allowed ones; those
-            of `parse_torchhub_name` and `parse_trained_model_name`.
+            of `parse_torchhub_name`, `parse_model_name` and `parse_exported_name`.
     """
     if name.startswith(TORCHHUB_PREFIX):
         return _torchhub_config(parse_torchhub_name(name))
     if name.startswith(TRAINED_PREFIX):
-        return _trained_config(parse_trained_model_name(name))
+        return _trained_config(parse_model_name(name))
+    if name.startswith(EXPORT_PREFIXES):
+        return _exported_config(name)
     base, colon, options = name.partition(":")
     config = EXTRACTOR_CONFIGS.get(base)
     if config is None:
@@ -246,8 +260,8 @@ def get_extractor_config(name: str, *, allow_test_extractors: bool) -> Extractor
         raise Misconfigured(
             "unknown_extractor",
             f"There is no extractor {base!r}. Available: {known}, "
-            f"{TORCHHUB_PREFIX}OWNER/NAME@COMMIT:ENTRY, and "
-            f"{TRAINED_PREFIX}NAME for a model that was added.",
+            f"{TORCHHUB_PREFIX}OWNER/NAME@COMMIT:ENTRY, and for models that were added "
+            f"{TRAINED_PREFIX}NAME, {'NAME and '.join(EXPORT_PREFIXES)}NAME.",
         )
     if config.for_tests and not allow_test_extractors:
         raise Misconfigured(
@@ -263,41 +277,63 @@ def pooled_config(config: ExtractorConfig) -> ExtractorConfig:
 
     It has the same patch features and preprocessing, and needs no vocabulary.
     """
-    base, _, options = config.name.partition(":")
-    shared = [
-        option
-        for option in options.split(",")
-        if option.partition("=")[0] in ("facet", "layer", "preprocessing")
-    ]
+    base = config.model.extractor if config.model else config.name.partition(":")[0]
+    options = config.name[len(base) + 1 :].split(",")
+    kept = ("facet=", "layer=", "preprocessing=", "input.")
+    shared = [option for option in options if option.startswith(kept)]
     return get_extractor_config(
         f"{base}:{','.join([*shared, 'aggregator=gem'])}", allow_test_extractors=config.for_tests
     )
 
 
 def _torchhub_config(hub: TorchHubEntry) -> ExtractorConfig:
-    is_default_size = hub.height == hub.width == DEFAULT_INPUT_SIDE_PIXELS
     return ExtractorConfig(
         name=hub.name,
         backbone="torchhub",
         implementation="torchhub:TorchHubBackbone",
         width=None,
         parameters=None,
-        preprocessing="square224" if is_default_size else f"resize{hub.height}x{hub.width}",
+        preprocessing=hub.input.preprocessing,
         aggregator="none",
         hub=hub,
     )
 
 
-def _trained_config(trained: TrainedModelName) -> ExtractorConfig:
+def _exported_config(name: str) -> ExtractorConfig:
+    model, network_input, options = parse_exported_name(name)
+    config = ExtractorConfig(
+        name=model.extractor,
+        backbone=model.prefix.removesuffix(":"),
+        implementation="exported:ExportedBackbone",
+        width=None,
+        parameters=None,
+        preprocessing=network_input.preprocessing,
+        aggregator="none",
+        model=model,
+        input=network_input,
+    )
+    if options:
+        config = _apply_options(config, options)
+    changed = config.name[len(model.extractor) + 1 :].split(",")
+    texts = sorted(filter(None, [*changed, *network_input.options]))
+    name = ":".join(filter(None, [model.extractor, ",".join(texts)]))
+    if len(name) > MAX_NAME_CHARACTERS:
+        raise _bad_option_error(
+            f"The name {name} has {len(name)} characters, the maximum is {MAX_NAME_CHARACTERS}."
+        )
+    return replace(config, name=name)
+
+
+def _trained_config(model: ModelName) -> ExtractorConfig:
     return ExtractorConfig(
-        name=trained.extractor,
+        name=model.extractor,
         backbone="gsv",
         implementation="trained:TrainedBackbone",
         width=None,
         parameters=None,
         preprocessing=None,
         aggregator="none",
-        trained=trained,
+        model=model,
     )
 
 
@@ -358,6 +394,8 @@ OptionParser = tuple[Callable[[str], Any], str]
 def _allowed_options(base: ExtractorConfig, config: ExtractorConfig) -> dict[str, OptionParser]:
     """Return parser and description of the options of `base`, with the aggregator of `config`."""
     allowed: dict[str, OptionParser] = {}
+    if base.input is not None:
+        allowed["aggregator"] = _one_of(("none", *EXTRACTOR_AGGREGATORS))
     if base.needs_vocabulary:
         allowed["aggregator"] = _one_of(EXTRACTOR_AGGREGATORS)
         allowed["preprocessing"] = _one_of(

@@ -178,6 +178,16 @@ def _fit_area(image: Image.Image, height: int, width: int) -> Pixels:
     return _squeeze(image, height, width)
 
 
+def _native1024(image: Image.Image) -> Pixels:
+    """Keep the photo's size; a longer side of more than 1024 pixels becomes 1024.
+
+    The aspect ratio is kept. Bilinear, antialiased, rounded.
+    """
+    scale = min(1.0, 1024 / max(image.size))
+    height, width = (max(1, round(side * scale)) for side in (image.height, image.width))
+    return _squeeze(image, height, width)
+
+
 def _demo1024(image: Image.Image) -> Pixels:
     """Resize as AnyLoc's demo/anyloc_vlad_generate.py does.
 
@@ -256,6 +266,7 @@ PREPROCESSINGS = {
             "square32", 1, True, 32 * 32, (32, 32), partial(_squeeze, height=32, width=32)
         ),
         _area_preprocessing(288, 384),
+        Preprocessing("native1024", 1, True, 1024 * 1024, (768, 1024), _native1024),
         Preprocessing("demo1024", 1, False, 1022 * 1022, (756, 1022), _demo1024),
         Preprocessing("paper480x640", 1, False, 476 * 630, (476, 630), _paper480x640),
         Preprocessing("round14", 1, False, ROUND14_MAX_PIXELS, (770, 1022), _round14),

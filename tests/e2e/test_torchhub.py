@@ -33,7 +33,7 @@ def server(
     spelled_otherwise = allowed.replace("64x64", "064x64")
     both = f"{spelled_otherwise} torchhub:{folder}:maps"
     home = tmp_path_factory.mktemp("server") / "home"
-    with ServerProcess(home, torchhub_allowed=both) as started:
+    with ServerProcess(home, code_allowed=both) as started:
         yield started
 
 
@@ -75,7 +75,7 @@ def test_an_entry_that_is_not_allowed_by_its_exact_name_is_refused(
     params = {"name": "other", "extractor": f"torchhub:{folder}:{entry}"}
     answer = server.client.post(MAPS, json=params)
     field_refused(answer, "extractor")
-    assert "TORCHHUB_ALLOWED" in answer.json()["detail"]
+    assert "CODE_ALLOWED" in answer.json()["detail"]
 
 
 def test_an_entry_that_is_no_extractor_keeps_photos_waiting_with_the_reason(

@@ -13,6 +13,7 @@ from shared.descriptors.backbones import normalise_pixels
 from shared.descriptors.vpr_models.checkpoint import checkpoint_state
 from shared.descriptors.vpr_models.config import VprModelConfig
 from shared.descriptors.vpr_models.model import VprModel, build_vpr_model
+from shared.extractor_config.configs import ExtractorConfig
 from shared.imaging.decode import decode_photo
 from shared.imaging.preprocessing import get_preprocessing
 from shared.storage.chunks import Rows
@@ -72,5 +73,5 @@ def own_output(model: VprModel, photo: bytes) -> Rows:
     return row
 
 
-def none_added(name: str, device: torch.device) -> NoReturn:
-    raise AssertionError(f"nothing in this test names the model {name!r}")
+def none_added(config: ExtractorConfig, device: torch.device) -> NoReturn:
+    raise AssertionError(f"nothing in this test names the model {config.name}")

@@ -65,23 +65,23 @@ def _added_backbone(
     config: ExtractorConfig, settings: Settings, device: torch.device
 ) -> Backbone | None:
     """Load an added model from the catalog and store, which may be in use; None for others."""
-    name = config.trained.registered if config.trained else None
-    if name is None:
+    if config.model is None or config.model.registered is None:
         return None
+    name, prefix = config.model.registered, config.model.prefix
     catalog_file = settings.placewise_home / "catalog.sqlite"
     if settings.database_url is None and not catalog_file.exists():
         raise Misconfigured(
             "model_missing",
             f"Can't load the model {name!r}: there is no catalog in PLACEWISE_HOME "
-            f"({settings.placewise_home}). Add the model there (`placewise models add CHECKPOINT "
-            f"--name {name}`), or use the checkpoint itself: gsv:/FOLDER/FILE.ckpt.",
+            f"({settings.placewise_home}). Add the model there (`placewise models add FILE --name "
+            f"{name}`), or use the file itself: {prefix}/FOLDER/FILE.",
             model=name,
         )
     with contextlib.closing(open_catalog(settings, "describe")) as catalog:
         try:
             check_schema(catalog)
             store = open_store(settings, exclusive=False)
-            return AddedModelLoader(catalog, store, settings).load(name, device)
+            return AddedModelLoader(catalog, store, settings).load(config, device)
         except SQLAlchemyError as error:
             unavailable = explain_outage(error)
             if unavailable is None:

@@ -89,7 +89,7 @@ def list_extractor_configs(settings: Settings) -> Iterator[ExtractorConfig]:
         (*EXTRACTOR_CONFIGS, settings.new_map_extractor, *settings.allowed_hub_extractors)
     )
     configs = (get_extractor_config(name, allow_test_extractors=True) for name in names)
-    yield from (config for config in configs if not config.for_tests and config.trained is None)
+    yield from (config for config in configs if not config.for_tests and config.model is None)
 
 
 def inspect_weights(

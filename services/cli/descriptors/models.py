@@ -1,7 +1,7 @@
 """`placewise models`: extractor weights on this machine, and trained models added to a server.
 
-`list` and `fetch` inspect and download weights locally; `add`, `added` and `remove` manage the
-models of `placewise train` on a server.
+`list` and `fetch` inspect and download weights locally; `add`, `added` and `remove` manage models
+of `placewise train` and exported networks on a server.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ from services.cli.output import (
 from shared.errors import Misconfigured
 from shared.extractor_config.configs import MAX_PCA_DIMENSION, get_extractor_config
 
+EXPORTED_NETWORK = {"backbone_arch": "exported", "agg_arch": ""}  # nothing else is known of it
+
 app = typer.Typer(help="Manage extractor weights, trained models and PCA files.")
 
 
@@ -48,18 +50,28 @@ def add(
     checkpoint: Annotated[
         Path,
         typer.Argument(
-            metavar="CHECKPOINT",
+            metavar="FILE",
             exists=True,
             dir_okay=False,
-            help="Checkpoint of `placewise train` (.ckpt).",
+            help="Checkpoint of `placewise train` (.ckpt), TorchScript file or ONNX file (.onnx).",
         ),
     ],
     name: Annotated[
         str,
         typer.Option(
-            "--name", metavar="NAME", help="Permanent name; maps refer to it as gsv:NAME."
+            "--name",
+            metavar="NAME",
+            help="Permanent name; maps refer to it as gsv:NAME, torchscript:NAME or onnx:NAME.",
         ),
     ],
+    options: Annotated[
+        str | None,
+        typer.Option(
+            "--options",
+            help="TorchScript or ONNX file: what its network expects, and the aggregator, as in "
+            "input.size=288x288,aggregator=vlad.",
+        ),
+    ] = None,
     licence: Annotated[
         str | None, typer.Option("--licence", help="Licence of the weights.")
     ] = None,
@@ -69,10 +81,10 @@ def add(
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Upload a checkpoint of `placewise train` as an extractor for maps.
+    """Upload a checkpoint, TorchScript or ONNX file as an extractor for maps.
 
-    The server's extractor validates the checkpoint and stores only what is needed to describe
-    photos. `--map` only selects the map whose job list shows the job.
+    The server's extractor validates the file and stores only what is needed to describe photos.
+    `--map` only selects the map whose job list shows the job.
     """
     with connect(server, map_name, key) as client, progress_bar() as progress:
         client.models()  # fails before the upload if the URL or key is wrong
@@ -80,6 +92,7 @@ def add(
         started = client.add_model(
             checkpoint,
             name,
+            options=options,
             licence=licence,
             note=note,
             on_sent=lambda sent_bytes: progress.update(sending, completed=sent_bytes),
@@ -110,8 +123,8 @@ def list_added(
     for model in models:
         table.add_row(
             escape(model.extractor),
-            f"{model.config['backbone_arch']} {model.config['agg_arch']}",
-            "{}x{}".format(*model.image_size),
+            "{backbone_arch} {agg_arch}".format(**{**EXPORTED_NETWORK, **model.config}),
+            "{}x{}".format(*model.image_size) if model.image_size else "native",
             str(model.dimension),
             f"{model.size_bytes / 1e6:.1f} MB",
             escape(model.licence),
@@ -185,7 +198,7 @@ def fetch(
     config = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
     if config.for_tests:
         raise Misconfigured("no_weights", f"The extractor {config.name} has no weights.")
-    if config.trained is not None:
+    if config.model is not None:
         raise Misconfigured(
             "no_weights",
             f"The weights of {config.name} are in the object store, from which extractors load "
@@ -216,7 +229,7 @@ def fetch(
     print_message(f"Source: {weights.source}. Path: {weights.path}.")
     print_message(f"Licence: {weights.licence}. Fingerprint: {weights.fingerprint}.")
     if config.hub is not None and config.name not in settings.allowed_hub_extractors:
-        print_message(f"To allow maps to use it, set TORCHHUB_ALLOWED={config.name}")
+        print_message(f"To allow maps to use it, set CODE_ALLOWED={config.name}")
 
 
 @app.command("fit-pca")

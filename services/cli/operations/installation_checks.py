@@ -134,7 +134,7 @@ def check_extractor(settings: Settings) -> str:
 def _check_weights(config: ExtractorConfig, settings: Settings) -> str:
     from shared.descriptors.backbones import backbone_class
 
-    if not config.for_tests and config.trained is None:
+    if not config.for_tests and config.model is None:
         path = backbone_class(config).find_weights(config, settings.dino_weights).path
         if config.depth is not None:
             return (

@@ -1,4 +1,4 @@
-"""Routes of the model registry: add, list and remove trained models.
+"""Routes of the model registry: add, list and remove models.
 
 The gateway stores an uploaded checkpoint and queues a job, but never loads it: an extractor
 validates it (`services.extractor.added_models`).
@@ -36,8 +36,14 @@ from shared.catalog.models import (
     list_registered_models,
     remove_model,
 )
-from shared.errors import PlacewiseError, TooLarge, invalid_field_error
-from shared.extractor_config.names import MODEL_NAME_PATTERN, MODEL_NAME_RULE
+from shared.errors import Misconfigured, PlacewiseError, TooLarge, invalid_field_error
+from shared.extractor_config.configs import get_extractor_config
+from shared.extractor_config.names import (
+    MAX_NAME_CHARACTERS,
+    MODEL_NAME_PATTERN,
+    MODEL_NAME_RULE,
+    ONNX_PREFIX,
+)
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
 from shared.storage.keys import new_checkpoint_key
@@ -50,7 +56,14 @@ MODEL_FORM_FIELDS: dict[str, dict[str, Any]] = {
     "name": {
         "type": "string",
         "pattern": MODEL_NAME_PATTERN,
-        "description": "maps use the model as gsv:NAME; a name is never reused for other weights",
+        "description": "maps use the model as gsv:NAME, torchscript:NAME or onnx:NAME; a name is "
+        "never reused for other weights",
+    },
+    "options": {
+        "type": "string",
+        "maxLength": MAX_NAME_CHARACTERS,
+        "description": "of a TorchScript or ONNX file: what its network expects, and the "
+        "aggregator, such as input.size=288x288,aggregator=vlad",
     },
     "licence": {
         "type": "string",
@@ -70,12 +83,17 @@ ModelNamePath = Annotated[
 class ModelResponse(ResponseModel):
     name: str = Field(validation_alias="added_name")
     extractor: str = Field(
-        validation_alias="name", description="extractor name that maps use: gsv:NAME"
+        description="extractor name that maps use: gsv:NAME, torchscript:NAME:OPTIONS"
     )
     fingerprint: str = Field(description="SHA-256 of its configuration and weights")
-    dimension: int = Field(description="dimension of its descriptors")
-    image_size: tuple[int, int] = Field(description="height and width that photos are resized to")
-    config: dict[str, Any] = Field(description="configuration of backbone and aggregator")
+    dimension: int = Field(description="dimension of its descriptors, or of a patch's feature")
+    image_size: tuple[int, int] | None = Field(
+        description="height and width that photos are resized to; null: their own"
+    )
+    config: dict[str, Any] = Field(
+        description="configuration of backbone and aggregator; of a TorchScript or ONNX file the "
+        "name of the extractor"
+    )
     size_bytes: int = Field(description="size of its file in the object store")
     sha256: str = Field(description="SHA-256 of that file")
     licence: str
@@ -90,7 +108,12 @@ class ModelResponse(ResponseModel):
     def of(cls, session: Session, model: Model) -> ModelResponse:
         assert model.config is not None
         maps = list_maps_using_model(session, model)
-        return cls.of_row(model, image_size=model.config["image_size"], maps=maps)
+        return cls.of_row(
+            model,
+            extractor=model.config.get("extractor", model.name),
+            image_size=model.config["image_size"],
+            maps=maps,
+        )
 
 
 class ModelsResponse(ResponseModel):
@@ -108,7 +131,9 @@ class RemovedModelResponse(ResponseModel):
     operation_id="add_model",
     status_code=202,
     openapi_extra=multipart_schema(
-        "a checkpoint (`.ckpt`) of `placewise train`", ["name"], **MODEL_FORM_FIELDS
+        "a checkpoint (`.ckpt`) of `placewise train`, a TorchScript or an `.onnx` file",
+        ["name"],
+        **MODEL_FORM_FIELDS,
     ),
     dependencies=[ADMIN, ADMIT_JOB],
 )
@@ -119,11 +144,12 @@ async def upload_model(
     admission: AdmissionDep,
     query: MapQuery,
 ) -> JobAcceptedResponse:
-    """Add a trained model: upload its checkpoint with a `name`.
+    """Add a model: upload its checkpoint, TorchScript or ONNX file with a `name`.
 
     An extractor validates it in a job of the map: it must be readable without executing code, its
-    weights must be finite, and it must produce a descriptor. The job fails with the reason if the
-    checkpoint can't be used or the name belongs to other weights.
+    weights must be finite, and it must produce a descriptor. The code of a TorchScript file is
+    executed, if CODE_ALLOWED lists its hash. The job fails with the reason if the file can't be
+    used or the name belongs to other weights.
     """
     with admission.admit_upload(UploadKind.UPLOAD, request):
         async with receive_form_file(
@@ -189,7 +215,7 @@ def delete_model(gateway: GatewayDep, name: ModelNamePath) -> RemovedModelRespon
 
 
 def _parse_model_fields(fields: dict[str, str]) -> dict[str, str | None]:
-    """Validate and return the fields `name`, `licence` and `note` of the form."""
+    """Validate and return the fields `name`, `options`, `licence` and `note` of the form."""
     for field in fields.keys() - MODEL_FORM_FIELDS.keys():
         raise invalid_field_error(field, f"is unknown; valid are {', '.join(MODEL_FORM_FIELDS)}")
     name = fields.get("name", "")
@@ -204,8 +230,15 @@ def _parse_model_fields(fields: dict[str, str]) -> dict[str, str | None]:
             raise invalid_field_error(
                 field, f"must have at most {max_characters} characters, without NUL"
             )
+    options = fields.get("options") or None
+    if options is not None:
+        try:  # the format does not matter: all have the same options
+            get_extractor_config(f"{ONNX_PREFIX}{name}:{options}", allow_test_extractors=False)
+        except Misconfigured as error:
+            raise invalid_field_error("options", error.detail) from None
     return {
         "name": name,
+        "options": options,
         "licence": fields.get("licence") or None,
         "note": fields.get("note") or None,
     }

@@ -17,6 +17,7 @@ from torch.nn.functional import normalize
 
 from shared.descriptors.weight_files import OnProgress
 from shared.extractor_config.configs import MAX_WIDTH, ExtractorConfig
+from shared.extractor_config.names import NetworkInput
 from shared.imaging.preprocessing import Preprocessing
 
 MIN_NORM = 1e-12  # shorter features are noise and are not scaled up to length 1
@@ -139,6 +140,17 @@ def normalise_pixels(
     shape = (1, 3, 1, 1)
     centre = torch.tensor(mean, device=pixels.device).view(shape)
     return (scaled - centre) / torch.tensor(std, device=pixels.device).view(shape)
+
+
+def to_network_input(pixels: torch.Tensor, expected: NetworkInput) -> torch.Tensor:
+    """Convert (B, H, W, 3) uint8 pixels to the range and layout that a network expects."""
+    if expected.range is None:
+        batch = normalise_pixels(pixels, expected.mean, expected.std)
+    else:
+        batch = pixels.permute(0, 3, 1, 2)
+        if expected.range != "uint8":
+            batch = batch.float() / (255.0 if expected.range == "1" else 1.0)
+    return batch.permute(0, 2, 3, 1) if expected.layout == "nhwc" else batch
 
 
 def probe_photos(height: int, width: int) -> torch.Tensor:

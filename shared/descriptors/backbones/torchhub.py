@@ -32,8 +32,8 @@ from shared.descriptors.backbones import (
     StoredWeights,
     find_descriptor_fault,
     normalise_features,
-    normalise_pixels,
     probe_photos,
+    to_network_input,
 )
 from shared.descriptors.weight_files import (
     OnProgress,
@@ -44,6 +44,7 @@ from shared.descriptors.weight_files import (
 from shared.errors import Misconfigured, PlacewiseError
 from shared.extractor_config.configs import ExtractorConfig
 from shared.extractor_config.names import TORCHHUB_PREFIX, TorchHubEntry
+from shared.imaging.preprocessing import get_preprocessing
 
 GITHUB = "https://github.com"
 HUBCONF = "hubconf.py"
@@ -336,21 +337,21 @@ class TorchHubBackbone(Backbone):
         return normalise_features(self._forward(pixels)).unsqueeze(1)
 
     def _forward(self, pixels: torch.Tensor) -> Any:
-        batch = normalise_pixels(pixels.to(self.device), self._hub.mean, self._hub.std)
-        out = self._module(batch)
+        out = self._module(to_network_input(pixels.to(self.device), self._hub.input))
         return out[0] if isinstance(out, tuple | list) and out else out
 
     @torch.inference_mode()
     def _probe(self) -> int:
         """Return the descriptor's dimension; raise `torchhub_unusable` for invalid descriptors."""
         hub = self._hub
-        photos = probe_photos(hub.height, hub.width)
+        height, width = get_preprocessing(hub.input.preprocessing).typical_size
+        photos = probe_photos(height, width)
         try:
             both, alone = self._forward(photos), self._forward(photos[:1])
         except Exception as error:  # third-party networks may raise anything
             raise _torchhub_unusable_error(
                 hub,
-                f"with 2 photos of {hub.height} x {hub.width} pixels it fails with "
+                f"with 2 photos of {height} x {width} pixels it fails with "
                 f"{type(error).__name__}: {first_error_line(error)}",
             ) from error
         fault = find_descriptor_fault(both, alone)

@@ -72,9 +72,9 @@ class TrainedBackbone(Backbone):
         cls, config: ExtractorConfig, device: torch.device, weights: Path | None
     ) -> TrainedBackbone:
         """Load and check a local checkpoint; raises as `load_checkpoint` and `check`."""
-        assert config.trained is not None
-        assert config.trained.file is not None, "a registered model is loaded through the catalog"
-        path = Path(config.trained.file)
+        assert config.model is not None
+        assert config.model.file is not None, "a registered model is loaded through the catalog"
+        path = Path(config.model.file)
         loaded = load_checkpoint(path)
         card = {"source": path.name, **loaded.about}
         backbone = cls(

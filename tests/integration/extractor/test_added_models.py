@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
+from uuid import UUID
 
 import httpx2
 import numpy as np
@@ -14,13 +17,17 @@ import torch
 from sqlalchemy import select, update
 
 from services.extractor import model_changes
+from services.extractor.worker import ExtractorWorker
 from services.steward.tasks.garbage_collection import collect_checkpoints
 from services.steward.tasks.model_changes import advance_model_changes
 from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import get_map
 from shared.catalog.models import Model, remove_model
+from shared.descriptors.backbones import normalise_pixels
 from shared.descriptors.backbones.torchhub import module_fingerprint
+from shared.imaging.decode import decode_photo
+from shared.imaging.preprocessing import get_preprocessing
 from shared.jobs import InProcessWakeups
 from shared.storage.keys import CHECKPOINTS, MODELS
 from tests.integration.in_process_api import Service
@@ -33,6 +40,15 @@ from tests.support.checkpoints import (
     own_output,
     some_checkpoint,
     untrained,
+)
+from tests.support.exported import (
+    DIMENSION,
+    PATCH_WIDTH,
+    SIDE,
+    code_name,
+    onnx_of,
+    tiny_network,
+    tiny_torchscript,
 )
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
@@ -384,3 +400,124 @@ def test_a_model_that_is_removed_at_the_last_moment_begins_no_generation(
     monkeypatch.setattr(model_changes, "start_generation", remove_first)
     failed(walks, switch(walks, extractor="gsv:walks"), "model_missing")
     assert active(walks).id == before
+
+
+# --- exported networks -----------------------------------------------------------------------
+
+SIZE = f"input.size={SIDE}x{SIDE}"
+
+
+def send_exported(
+    service: Service, data: bytes, file: str, name: str = "tiny", options: str = SIZE
+) -> httpx2.Response:
+    fields = {"name": name, "options": options}
+    return service("POST", "/models", files={"file": (file, data)}, data=fields)
+
+
+@pytest.fixture
+def allowing(service: Service, make_worker: Callable[..., ExtractorWorker]) -> Service:
+    """With an extractor that may execute the code of the tiny TorchScript files."""
+    code = code_name(tiny_torchscript())
+    return Service(
+        service.catalog,
+        service.store,
+        service.settings,
+        lambda: make_worker(code_allowed=code, pool_without_vocabulary=True),
+    )
+
+
+def test_torchscript_code_runs_only_where_its_hash_is_allowed(
+    service: Service, allowing: Service
+) -> None:
+    data = tiny_torchscript()
+    reason = failed(service, send_exported(service, data, "net.pt"), "code_not_allowed")
+    assert code_name(data) in reason
+    added = done(allowing, send_exported(allowing, data, "net.pt"))
+    assert added["extractor"] == f"torchscript:tiny:{SIZE}"
+    assert added["fingerprint"] == hashlib.sha256(data).hexdigest()
+    # Another worker may have been started without it.
+    service.json("POST", "/maps", 201, json={"name": "new", "extractor": added["extractor"]})
+    job_id = service.upload(photo_bytes(1), "new")["job_id"]
+    service.drain()
+    waits = service.json("GET", f"/jobs/{job_id}", params={"map": "new"})
+    assert (waits["state"], waits["error"]["code"]) == ("queued", "code_not_allowed")
+    other = tiny_torchscript(seed=8)
+    failed(allowing, send_exported(allowing, other, "net.pt", "other"), "code_not_allowed")
+
+
+def test_an_exported_network_is_listed_used_kept_and_removed(
+    allowing: Service, tmp_path: Path
+) -> None:
+    data = onnx_of(tiny_network(), tmp_path)
+    extractor = done(allowing, send_exported(allowing, data, "net.onnx"))["extractor"]
+    (body,) = allowing.json("GET", "/models")["models"]
+    assert (body["name"], body["extractor"]) == ("tiny", extractor)
+    assert (body["dimension"], body["image_size"]) == (DIMENSION, [SIDE, SIDE])
+    assert body["about"] == {"source": "net.onnx"}
+    # Its name means this file only, whatever the kind.
+    script = tiny_torchscript()
+    failed(allowing, send_exported(allowing, script, "net.pt"), "model_name_taken")
+    problem(switch(allowing, extractor=f"torchscript:tiny:{SIZE}"), 404, "model_missing")
+    problem(switch(allowing, extractor="gsv:tiny"), 404, "model_missing")
+    ids = allowing.indexed(*range(PHOTOS))
+    done(allowing, switch(allowing, extractor=extractor))
+    generation = active(allowing)
+    assert generation.spec["backbone_fingerprint"] == hashlib.sha256(data).hexdigest()
+    rows = stored_rows(allowing.catalog, allowing.store, generation.id)
+    preprocessing = get_preprocessing(f"resize{SIDE}x{SIDE}")
+    for number, photo_id in enumerate(ids):
+        pixels = decode_photo(photo_bytes(number), preprocessing, 10**9).pixels
+        batch = normalise_pixels(torch.from_numpy(pixels[None].copy()), MEAN, STD)
+        expected = torch.nn.functional.normalize(tiny_network()(batch), dim=-1)[0]
+        np.testing.assert_allclose(rows[UUID(photo_id)], expected, rtol=2**-10, atol=1e-5)
+    used = problem(allowing("DELETE", "/models/tiny"), 409, "model_in_use")
+    assert used["maps"] == ["default"]
+    done(allowing, switch(allowing, extractor="test-tiny-avg"))
+    allowing.json("DELETE", "/models/tiny")
+
+
+def test_patches_of_an_exported_network_get_a_vocabulary_of_the_map(
+    allowing: Service, tmp_path: Path
+) -> None:
+    options = f"aggregator=vlad,clusters=4,{SIZE}"
+    data = onnx_of(tiny_network(patches=True), tmp_path)
+    started = send_exported(allowing, data, "net.onnx", "town", options)
+    extractor = done(allowing, started)["extractor"]
+    allowing.json("POST", "/maps", 201, json={"name": "town", "extractor": extractor})
+    allowing.indexed(*range(3 * PHOTOS), map_name="town")
+    pooled = active(allowing, "town")
+    assert (pooled.extractor, pooled.dimension) == (
+        f"onnx:town:aggregator=gem,{SIZE}",
+        PATCH_WIDTH,
+    )
+    fitted = allowing("POST", "/vocabularies", params={"map": "town"}, json={})
+    clusters = done(allowing, fitted, "town")["clusters"]
+    generation = active(allowing, "town")
+    assert clusters > 1
+    assert (generation.extractor, generation.dimension) == (extractor, clusters * PATCH_WIDTH)
+    assert allowing.json("GET", "/models/town")["maps"] == ["town"]
+
+
+@pytest.mark.parametrize(
+    ("data", "file", "options", "code"),
+    [
+        (b"no network", "net.onnx", SIZE, "model_unusable"),
+        (tiny_torchscript(), "net.pt", "input.size=32x32", "model_unusable"),
+        (tiny_torchscript(), "net.pt", f"aggregator=vlad,{SIZE}", "model_unusable"),
+        (tiny_torchscript()[:-400], "net.pt", SIZE, "checkpoint_unreadable"),
+    ],
+)
+def test_a_file_that_is_no_network_for_photos_fails_and_leaves_nothing(
+    allowing: Service, data: bytes, file: str, options: str, code: str
+) -> None:
+    failed(allowing, send_exported(allowing, data, file, options=options), code)
+    assert keys(allowing, MODELS) == []
+    assert allowing.json("GET", "/models")["models"] == []
+
+
+def test_options_of_an_exported_network_are_validated_before_the_file_is_read(
+    service: Service,
+) -> None:
+    field_refused(send_exported(service, b"any", "net.onnx", options="input.size=9"), "options")
+    assert keys(service, CHECKPOINTS) == []
+    field_refused(switch(service, extractor=f"onnx:/etc/passwd:{SIZE}"), "extractor")

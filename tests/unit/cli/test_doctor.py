@@ -128,7 +128,7 @@ def test_an_allowed_model_of_torch_hub_that_was_loaded_here_is_suggested_first(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     name = f"torchhub:{write_hub(tmp_path / 'hub')}:colours"
     weights = save(random_weights(SHAPES["vits14"], blocks=11), tmp_path / "vits.pth")
-    settings = settings_with(monkeypatch, TORCHHUB_ALLOWED=name, DINO_WEIGHTS=weights)
+    settings = settings_with(monkeypatch, CODE_ALLOWED=name, DINO_WEIGHTS=weights)
     assert "EXTRACTOR=anyloc-vits14 " in str(suggest_extractor(settings)), "never loaded"
     monkeypatch.setattr(local_weights, "_load_record", lambda _key: WeightsRecord("f" * 64, 1))
     assert f"EXTRACTOR={name} " in str(suggest_extractor(settings))

@@ -203,7 +203,7 @@ def test_a_repository_is_fetched_at_its_commit_and_tried(
         f"somebody_places_{COMMIT}"
     ]
 
-    monkeypatch.setenv("TORCHHUB_ALLOWED", f"{REPOSITORY}  {REPOSITORY}:dimension=8")
+    monkeypatch.setenv("CODE_ALLOWED", f"{REPOSITORY}  {REPOSITORY}:dimension=8")
     server.files.clear()
     found = listed(REPOSITORY)
     assert (found["available"], found["fingerprint"]) == (True, fetched["fingerprint"])
@@ -261,7 +261,7 @@ def test_fetched_code_says_how_maps_may_use_it(caches: Path) -> None:
     result = CliRunner().invoke(build_app(["models"]), ["models", "fetch", name])
     assert result.exit_code == 0, result.output
     reported = result.output.replace("\n", "")
-    assert f"TORCHHUB_ALLOWED={name}" in reported
+    assert f"CODE_ALLOWED={name}" in reported
     assert "Licence: none found" in reported
 
 

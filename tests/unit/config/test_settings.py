@@ -282,13 +282,13 @@ def test_only_listed_torch_hub_entries_are_allowed_by_their_canonical_names(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert Settings().allowed_hub_extractors == ()
-    monkeypatch.setenv("TORCHHUB_ALLOWED", f" {HUB}:b=2,a=01\n{HUB} ")
+    monkeypatch.setenv("CODE_ALLOWED", f" {HUB}:b=2,a=01\n{HUB} ")
     settings = Settings()
     assert settings.allowed_hub_extractors == (f"{HUB}:a=1,b=2", HUB)
     assert settings.extractor_config(f"{HUB}:b=02,a=1").name == f"{HUB}:a=1,b=2"
-    with pytest.raises(Misconfigured, match="TORCHHUB_ALLOWED") as caught:
+    with pytest.raises(Misconfigured, match="CODE_ALLOWED") as caught:
         settings.extractor_config(f"{HUB}:a=1")
-    assert caught.value.code == "torchhub_not_allowed"
+    assert caught.value.code == "code_not_allowed"
 
 
 def test_the_extractor_of_new_maps_is_allowed_by_being_chosen(
@@ -302,11 +302,11 @@ def test_the_extractor_of_new_maps_is_allowed_by_being_chosen(
 @pytest.mark.parametrize(
     ("variable", "value", "message"),
     [
-        ("TORCHHUB_ALLOWED", UNPINNED, "git ls-remote"),
+        ("CODE_ALLOWED", UNPINNED, "git ls-remote"),
         (
-            "TORCHHUB_ALLOWED",
+            "CODE_ALLOWED",
             f"{HUB} anyloc-vitb14",
-            "'anyloc-vitb14' is not a torch.hub extractor",
+            "'anyloc-vitb14' is neither a torch.hub extractor",
         ),
         ("EXTRACTOR", UNPINNED, "git ls-remote"),
     ],

@@ -44,12 +44,12 @@ def test_code_that_is_no_longer_allowed_is_not_executed(
     store: FolderStore, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     name = f"torchhub:{write_hub(tmp_path / 'hub')}:colours"
-    monkeypatch.setenv("TORCHHUB_ALLOWED", name)
+    monkeypatch.setenv("CODE_ALLOWED", name)
     assert ModelRegistry(store, Settings(), none_added).extractor(name).dimension(None) == 24
-    monkeypatch.setenv("TORCHHUB_ALLOWED", f"{name}:dimension=8")
+    monkeypatch.setenv("CODE_ALLOWED", f"{name}:dimension=8")
     with pytest.raises(Misconfigured) as caught:
         ModelRegistry(store, Settings(), none_added).extractor(name)
-    assert caught.value.code == "torchhub_not_allowed"
+    assert caught.value.code == "code_not_allowed"
     assert name in caught.value.detail
 
 
@@ -57,7 +57,7 @@ def test_networks_of_one_folder_share_nothing_unless_all_of_the_name_agrees(
     store: FolderStore, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     name = f"torchhub:{write_hub(tmp_path / 'hub')}:colours"
-    monkeypatch.setenv("TORCHHUB_ALLOWED", f"{name} {name}:dimension=8")
+    monkeypatch.setenv("CODE_ALLOWED", f"{name} {name}:dimension=8")
     models = ModelRegistry(store, Settings(), none_added)
     assert models.extractor(f"{name}:dimension=8").dimension(None) == 8
     assert models.extractor(name).dimension(None) == 24

@@ -199,7 +199,7 @@ def test_names_take_further_options() -> None:
 
 
 def test_preprocessings_are_those_that_vision_has() -> None:
-    assert set(IN_VISION) == {*PREPROCESSING_NAMES, "square32"}
+    assert set(IN_VISION) == {*PREPROCESSING_NAMES, "native1024", "square32"}
     for found in EXTRACTOR_CONFIGS.values():
         assert found.preprocessing is not None
         assert get_preprocessing(found.preprocessing).name == found.preprocessing

@@ -6,7 +6,12 @@ import pytest
 
 from shared.errors import Misconfigured
 from shared.extractor_config.configs import get_extractor_config
-from shared.extractor_config.names import IMAGENET_MEAN, TorchHubEntry, parse_torchhub_name
+from shared.extractor_config.names import (
+    IMAGENET_MEAN,
+    NetworkInput,
+    TorchHubEntry,
+    parse_torchhub_name,
+)
 from tests.support.hub import COMMIT
 
 REPOSITORY = f"torchhub:gmberton/eigenplaces@{COMMIT}:get_trained_model"
@@ -24,16 +29,15 @@ def test_a_repository_is_read_with_its_commit_entry_and_arguments() -> None:
     assert (hub.repository, hub.commit, hub.folder) == ("gmberton/eigenplaces", COMMIT, None)
     assert hub.entry == "get_trained_model"
     assert dict(hub.arguments) == {"backbone": "ResNet18", "fc_output_dim": 512, "pretrained": True}
-    assert (hub.height, hub.width, hub.mean) == (224, 224, IMAGENET_MEAN)
+    assert (hub.input.height, hub.input.width, hub.input.mean) == (224, 224, IMAGENET_MEAN)
 
 
 def test_a_folder_is_read_with_what_its_network_wants_to_see() -> None:
     hub = parse_torchhub_name(
         "torchhub:/models/mine/:entry:input.size=322x644,input.mean=0.5/0.5/0.25"
     )
-    assert hub == TorchHubEntry(
-        None, None, "/models/mine", "entry", height=322, width=644, mean=(0.5, 0.5, 0.25)
-    )
+    expected = NetworkInput(322, 644, mean=(0.5, 0.5, 0.25))
+    assert hub == TorchHubEntry(None, None, "/models/mine", "entry", input=expected)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,280 @@
+"""TorchScript and ONNX files: the same features as the eager module, and what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import TensorProto, helper
+from torch.nn.functional import normalize
+
+from shared.descriptors.backbones import normalise_pixels, probe_photos
+from shared.descriptors.backbones.exported import ExportedBackbone, exported_prefix
+from shared.descriptors.extractor import Extractor
+from shared.errors import Misconfigured, Unprocessable
+from shared.extractor_config.configs import get_extractor_config, pooled_config
+from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
+from tests.support.exported import (
+    DIMENSION,
+    PATCH_WIDTH,
+    SIDE,
+    onnx_of,
+    tiny_network,
+    tiny_torchscript,
+    torchscript_of,
+)
+
+pytestmark = pytest.mark.numerics
+
+CPU = torch.device("cpu")
+SIZE = f"input.size={SIDE}x{SIDE}"
+PHOTOS = probe_photos(SIDE, SIDE)
+
+
+@pytest.fixture(scope="module")
+def tiny_onnx(tmp_path_factory: pytest.TempPathFactory) -> Callable[[bool], bytes]:
+    return cache(
+        lambda patches: onnx_of(tiny_network(patches=patches), tmp_path_factory.mktemp("onnx"))
+    )
+
+
+def config_of(name: str) -> Any:
+    return get_extractor_config(name, allow_test_extractors=False)
+
+
+def backbone(name: str, data: bytes) -> ExportedBackbone:
+    return ExportedBackbone(config_of(name), data, CPU)
+
+
+def refusal(name: str, data: bytes) -> str:
+    with pytest.raises(Unprocessable) as caught:
+        backbone(name, data)
+    assert caught.value.code == "model_unusable"
+    return caught.value.detail
+
+
+def operators(
+    nodes: list[Any],
+    constants: list[Any] = [],  # noqa: B006
+    kind: int = TensorProto.FLOAT,
+    shape: tuple[Any, ...] = ("batch", 3, SIDE, SIDE),
+) -> bytes:
+    """An ONNX file of operators from `x` to `y`."""
+    graph = helper.make_graph(
+        nodes,
+        "graph",
+        [helper.make_tensor_value_info("x", kind, shape)],
+        [helper.make_tensor_value_info("y", TensorProto.FLOAT, None)],
+        constants,
+    )
+    opset = helper.make_opsetid("", 17)
+    data: bytes = helper.make_model(graph, opset_imports=[opset], ir_version=9).SerializeToString()
+    return data
+
+
+@pytest.mark.parametrize("kind", ["torchscript", "onnx"])
+def test_a_file_computes_what_the_eager_module_computes(
+    kind: str, tiny_onnx: Callable[[bool], bytes]
+) -> None:
+    batch = normalise_pixels(PHOTOS, IMAGENET_MEAN, IMAGENET_STD)
+    for patches in (False, True):
+        data = tiny_torchscript(patches=patches) if kind == "torchscript" else tiny_onnx(patches)
+        name = f"{kind}:tiny:{'aggregator=gem,' if patches else ''}{SIZE}"
+        loaded = backbone(name, data)
+        expected = tiny_network(patches=patches)(batch)
+        if patches:
+            assert loaded.width == PATCH_WIDTH
+            expected = expected.flatten(2).transpose(1, 2)
+        else:
+            assert loaded.width == DIMENSION
+            expected = expected.unsqueeze(1)
+        found = loaded.features(PHOTOS)
+        torch.testing.assert_close(found, normalize(expected, dim=-1), rtol=0, atol=1e-5)
+        torch.testing.assert_close(loaded.features(PHOTOS[:1]), found[:1], rtol=0, atol=1e-5)
+        assert loaded.fingerprint == hashlib.sha256(data).hexdigest()
+        assert loaded.card["size_bytes"] == len(data)
+
+
+@pytest.mark.parametrize(
+    ("option", "expected"),
+    [
+        ("input.range=255", lambda pixels: pixels.permute(0, 3, 1, 2).float()),
+        ("input.range=1", lambda pixels: pixels.permute(0, 3, 1, 2).float() / 255),
+        ("input.layout=nhwc,input.range=255", lambda pixels: pixels.float()),
+        (
+            "input.mean=0.5/0.5/0.5,input.std=0.5/0.5/0.5",
+            lambda pixels: pixels.permute(0, 3, 1, 2).float() / 127.5 - 1,
+        ),
+    ],
+)
+def test_a_network_gets_the_range_and_the_layout_that_it_expects(
+    option: str, expected: Callable[[torch.Tensor], torch.Tensor]
+) -> None:
+    shape = ("batch", SIDE, SIDE, 3) if "nhwc" in option else ("batch", 3, SIDE, SIDE)
+    data = operators([helper.make_node("Flatten", ["x"], ["y"])], shape=shape)
+    found = backbone(f"onnx:flat:{option},{SIZE}", data).features(PHOTOS)[:, 0]
+    torch.testing.assert_close(
+        found, normalize(expected(PHOTOS).flatten(1), dim=-1), rtol=1e-5, atol=1e-6
+    )
+
+
+def test_a_network_of_bytes_gets_bytes() -> None:
+    nodes = [
+        helper.make_node("Cast", ["x"], ["f"], to=TensorProto.FLOAT),
+        helper.make_node("Flatten", ["f"], ["y"]),
+    ]
+    data = operators(nodes, kind=TensorProto.UINT8)
+    found = backbone(f"onnx:bytes:input.range=uint8,{SIZE}", data).features(PHOTOS)[:, 0]
+    expected = PHOTOS.permute(0, 3, 1, 2).flatten(1).float()
+    torch.testing.assert_close(found, normalize(expected, dim=-1), rtol=1e-5, atol=1e-6)
+    assert "uint8" in refusal(f"onnx:bytes:{SIZE}", data)
+
+
+def test_an_export_for_one_photo_describes_the_photos_of_a_batch(tmp_path: Path) -> None:
+    data = onnx_of(tiny_network(), tmp_path, batch_size=1)
+    loaded = backbone(f"onnx:one:{SIZE}", data)
+    batch = normalise_pixels(PHOTOS, IMAGENET_MEAN, IMAGENET_STD)
+    expected = normalize(tiny_network()(batch), dim=-1)
+    torch.testing.assert_close(loaded.features(PHOTOS)[:, 0], expected, rtol=0, atol=1e-5)
+
+
+def test_photos_keep_their_size_for_a_network_that_takes_any(tmp_path: Path) -> None:
+    path = tmp_path / "any.onnx"
+    path.write_bytes(
+        operators(
+            [helper.make_node("AveragePool", ["x"], ["y"], kernel_shape=[8, 8], strides=[8, 8])],
+            shape=("batch", 3, "h", "w"),
+        )
+    )
+    config = config_of(f"onnx:{path}:aggregator=vlad,input.size=native,input.range=1")
+    extractor = Extractor(config, CPU)
+    photos = [np.full((64, 80, 3), 9, np.uint8), np.full((40, 24, 3), 200, np.uint8)]
+    assert [len(each) for each in extractor.patch_features(photos)] == [80, 15]
+    assert extractor.spec(None)["preprocessing"] == {"name": "native1024", "version": 1}
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "reason"),
+    [
+        (f"onnx:x:aggregator=vlad,{SIZE}", "descriptors", "(2, 24)"),
+        (f"onnx:x:{SIZE}", "patches", "(2, 6, 4, 4)"),
+        ("onnx:x", "descriptors", "224"),
+    ],
+)
+def test_an_output_of_another_shape_is_refused_with_what_was_expected(
+    name: str, file: str, reason: str, tiny_onnx: Callable[[bool], bytes]
+) -> None:
+    detail = refusal(name, tiny_onnx(file == "patches"))
+    assert reason in detail
+    assert "input.size" in detail
+
+
+class Wrong(torch.nn.Module):
+    def __init__(self, fault: str) -> None:
+        super().__init__()
+        self.fault = fault
+
+    def forward(self, batch: torch.Tensor) -> torch.Tensor:
+        pooled = torch.nn.functional.avg_pool2d(batch, 8).flatten(1)
+        if self.fault == "nan":
+            return pooled / 0.0 - pooled / 0.0
+        if self.fault == "same":
+            return pooled * 0 + 1
+        return pooled - 0.9 * pooled.mean(dim=0) * (batch.shape[0] > 1)
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [("nan", "NaN or infinite"), ("same", "are equal"), ("batch", "other photos of its batch")],
+)
+def test_descriptors_that_can_not_be_used_are_refused(fault: str, reason: str) -> None:
+    assert reason in refusal(f"torchscript:x:{SIZE}", torchscript_of(Wrong(fault)))
+
+
+@pytest.mark.parametrize("kind", ["torchscript", "onnx"])
+def test_a_damaged_file_is_refused(kind: str, tiny_onnx: Callable[[bool], bytes]) -> None:
+    data = tiny_torchscript() if kind == "torchscript" else tiny_onnx(False)
+    for damaged in (data[: len(data) // 2], b"", b"\x00" * 100, b"\xff" * 100, data[::-1]):
+        assert "can't be read" in refusal(f"{kind}:x:{SIZE}", damaged)
+
+
+def test_an_onnx_file_that_names_other_files_is_refused_with_how_to_save_it_as_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # from which ONNX Runtime would read it
+    separate = onnx_of(tiny_network(), tmp_path, external=True)
+    assert list(tmp_path.glob("net.onnx.data"))
+    assert "external_data=False" in refusal(f"onnx:x:{SIZE}", separate)
+    # Hidden in the branch of a condition.
+    (tmp_path / "secret").write_bytes(np.ones(3, np.float32).tobytes())
+    hidden = helper.make_tensor("w", TensorProto.FLOAT, [3], [1, 1, 1])
+    del hidden.float_data[:]
+    hidden.data_location = TensorProto.EXTERNAL
+    hidden.external_data.add(key="location", value="secret")
+    branch = helper.make_graph(
+        [helper.make_node("Constant", [], ["b"], value=hidden)],
+        "branch",
+        [],
+        [helper.make_tensor_value_info("b", TensorProto.FLOAT, [3])],
+    )
+    node = helper.make_node("If", ["c"], ["y"], then_branch=branch, else_branch=branch)
+    condition = helper.make_tensor("c", TensorProto.BOOL, [], [True])
+    assert "another file" in refusal(f"onnx:x:{SIZE}", operators([node], [condition]))
+
+
+def test_an_onnx_file_that_asks_for_more_memory_than_it_may_have_is_refused() -> None:
+    nodes = [
+        helper.make_node("ConstantOfShape", ["size"], ["z"]),
+        helper.make_node("ReduceMean", ["z"], ["r"], keepdims=0),
+        helper.make_node("Add", ["x", "r"], ["y"]),
+    ]
+    huge = helper.make_tensor("size", TensorProto.INT64, [1], [10**13])
+    assert "memory" in refusal(f"onnx:x:{SIZE}", operators(nodes, [huge]))
+    declared = helper.make_tensor("r", TensorProto.FLOAT, [1], [1.0])
+    declared.dims[0] = 10**12
+    add = helper.make_node("Add", ["x", "r"], ["y"])
+    assert "can't be read" in refusal(f"onnx:x:{SIZE}", operators([add], [declared]))
+
+
+def test_an_onnx_file_with_operators_of_its_own_is_refused() -> None:
+    own = helper.make_node("Steal", ["x"], ["y"], domain="org.example")
+    assert "can't be read" in refusal(f"onnx:x:{SIZE}", operators([own]))
+
+
+def test_a_file_that_was_replaced_describes_with_another_spec(tmp_path: Path) -> None:
+    path = tmp_path / "net.pt"
+    specs = []
+    for seed in (1, 2):
+        path.write_bytes(tiny_torchscript(seed=seed))
+        specs.append(Extractor(config_of(f"torchscript:{path}:{SIZE}"), CPU).spec(None))
+    assert specs[0]["extractor"] == specs[1]["extractor"]
+    assert specs[0]["backbone_fingerprint"] != specs[1]["backbone_fingerprint"]
+    with pytest.raises(Misconfigured, match="Check the path"):
+        Extractor(config_of("torchscript:/no/file.pt"), CPU)
+
+
+def test_the_kind_of_a_file_is_known_from_its_content(tmp_path: Path) -> None:
+    script, checkpoint, text = (tmp_path / name for name in ("s.ckpt", "c.pt", "t.pt"))
+    script.write_bytes(tiny_torchscript())
+    torch.save({"state_dict": {}}, checkpoint)
+    text.write_text("no archive")
+    assert exported_prefix(script, "best.ckpt") == "torchscript:"
+    assert exported_prefix(checkpoint, "c.pt") is None
+    assert exported_prefix(text, "t.pt") is None
+    assert exported_prefix(text, "net.ONNX") == "onnx:"
+
+
+def test_a_map_without_a_vocabulary_pools_the_patches_of_the_same_network() -> None:
+    config = config_of(f"onnx:town:aggregator=vlad,clusters=32,{SIZE}")
+    pooled = pooled_config(config)
+    assert pooled.name == f"onnx:town:aggregator=gem,{SIZE}"
+    assert pooled.backbone_key == config.backbone_key
+    assert config.backbone_key != config_of(f"onnx:town:{SIZE}").backbone_key
+    assert onnx.__version__  # the tests' exports need it; services do not import it
