@@ -23,20 +23,14 @@ from shared.storage.keys import reconstruction_prefix
 
 
 class ComponentAlignment(BaseModel):
-    """A similarity from a component's frame to east, north, up in metres, and its error."""
+    """How a component lies on the earth."""
 
     model_config = ConfigDict(frozen=True)
 
     origin: tuple[float, float, float]
     """latitude and longitude in degrees, altitude in metres: where east, north and up are 0"""
-    scale: float
-    """metres per unit of the component"""
-    rotation: tuple[float, float, float, float]
-    """unit quaternion (w, x, y, z)"""
-    translation: tuple[float, float, float]
-    """metres"""
-    covariance: list[list[float]]
-    """(7, 7), as `shared.geometry.frames.Similarity` has it"""
+    similarity: dict[str, Any]
+    """`shared.geometry.frames.Similarity.as_json`: from the component to east, north and up"""
     rms_m: float
     """root of the mean squared distance of the photos' coordinates from the model"""
 

@@ -10,11 +10,12 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 from PIL.ExifTags import GPS, IFD, Base
 
 from shared.errors import Unprocessable
+from shared.geometry.cameras import focal_length_from_exif
 from shared.imaging.exif import TiffBlock
 from shared.imaging.file_formats import PHOTO_READ_ERRORS, check_pixel_count
 from shared.imaging.file_structure import read_structure
@@ -40,11 +41,7 @@ GPS_TAGS = (
 ROTATED_ORIENTATIONS = (5, 6, 7, 8)  # EXIF orientations that swap width and height
 BELOW_ZERO = (b"\1", b"\3")  # GPSAltitudeRef: below the sea, below the ellipsoid
 MAX_ALTITUDE_M = 100_000
-FILM_WIDTH_MM = 36
-# Millimetres by FocalPlaneResolutionUnit; an inch if it is missing.
-UNITS_MM = {None: 25.4, 2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-# Multiples of the longer side: from a fisheye to a telescope. Others are of a broken file.
-MIN_FOCAL_LENGTH, MAX_FOCAL_LENGTH = 0.1, 100.0
+EXIF_INCH = 2  # the default of FocalPlaneResolutionUnit
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +100,7 @@ def read_photo_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
         captured_at=gps_time or clock,
         time_zone_is_known=gps_time is not None or time_zone_is_known,
         camera=_camera(main, details),
-        focal_length=_focal_length(details, max(width, height)),
+        focal_length=_focal_length(details, structure.width, structure.height),
     )
 
 
@@ -152,21 +149,19 @@ def _altitude(gps: dict[int, Any]) -> float | None:
     return -altitude if gps.get(GPS.GPSAltitudeRef) in BELOW_ZERO else altitude
 
 
-def _focal_length(details: dict[int, Any], longer_side: int) -> float | None:
-    """Return the focal length as a multiple of the longer side (Exif 3.0, 4.6.6)."""
-    on_film = _number(details.get(Base.FocalLengthIn35mmFilm))  # 0 for unknown
-    millimetres = _number(details.get(Base.FocalLength))
-    pixels_per_unit = _number(details.get(Base.FocalPlaneXResolution))
-    unit = UNITS_MM.get(details.get(Base.FocalPlaneResolutionUnit))
-    focal_length = 0.0
-    if on_film:
-        focal_length = on_film / FILM_WIDTH_MM
-    elif millimetres and pixels_per_unit and unit:
-        # The resolution is that of the photo as it was taken: this file may be a smaller copy.
-        sides = (details.get(tag) for tag in (Base.ExifImageWidth, Base.ExifImageHeight))
-        taken = max((side for side in sides if isinstance(side, int)), default=0)
-        focal_length = millimetres / unit * pixels_per_unit / (taken or longer_side)
-    return focal_length if MIN_FOCAL_LENGTH <= focal_length <= MAX_FOCAL_LENGTH else None
+def _focal_length(details: dict[int, Any], width: int, height: int) -> float | None:
+    # The resolution is that of the photo as it was taken: this file may be a smaller copy.
+    taken = details.get(Base.ExifImageWidth), details.get(Base.ExifImageHeight)
+    if all(isinstance(side, int) and side > 0 for side in taken):
+        width, height = cast("tuple[int, int]", taken)
+    return focal_length_from_exif(
+        width,
+        height,
+        _number(details.get(Base.FocalLengthIn35mmFilm)),
+        _number(details.get(Base.FocalLength)),
+        _number(details.get(Base.FocalPlaneXResolution)),
+        details.get(Base.FocalPlaneResolutionUnit, EXIF_INCH),
+    )
 
 
 def _camera(main: dict[int, Any], details: dict[int, Any]) -> str | None:

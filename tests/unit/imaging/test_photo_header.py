@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from math import hypot
 from typing import Any
 
 import pytest
@@ -241,12 +242,12 @@ SENSOR = {Base.FocalLength: 4.0, Base.FocalPlaneXResolution: 5000.0}
 @pytest.mark.parametrize(
     ("tags", "multiple"),
     [
-        ({Base.FocalLengthIn35mmFilm: 27}, 0.75),
-        ({Base.FocalLengthIn35mmFilm: 27, **SENSOR}, 0.75),
+        ({Base.FocalLengthIn35mmFilm: 27}, 27 / hypot(36, 24) * hypot(64, 48) / 64),
+        ({Base.FocalLengthIn35mmFilm: 27, **SENSOR}, 27 / hypot(36, 24) * hypot(64, 48) / 64),
         ({Base.FocalLengthIn35mmFilm: 0}, None),
         ({Base.FocalLength: 4.0}, None),
         ({**SENSOR, Base.ExifImageWidth: 600, Base.ExifImageHeight: 800}, 4 / 25.4 * 5000 / 800),
-        ({**SENSOR, Base.FocalPlaneResolutionUnit: 3}, 4 / 10 * 5000 / 64),
+        ({**SENSOR, Base.FocalPlaneXResolution: 300.0, Base.FocalPlaneResolutionUnit: 3}, 1.875),
         ({**SENSOR, Base.FocalPlaneResolutionUnit: 9}, None),
         ({Base.FocalLengthIn35mmFilm: 65_000}, None),
     ],
