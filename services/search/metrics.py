@@ -18,6 +18,8 @@ from shared.errors import PlacewiseError
 from shared.search_api.protocol import (
     MatchRequest,
     MatchResponse,
+    PoseRequest,
+    PoseResponse,
     SearchRequest,
     SearchResponse,
     SearchStatus,
@@ -72,6 +74,17 @@ class MeteredSearch:
         self._matched_photos = counter(
             "matched_photos", "Photos by outcome: matched or without_features.", ["outcome"]
         )
+        self._poses = counter(
+            "poses", "Pose requests by outcome: answered, or the error code.", ["outcome"]
+        )
+        self._pose_seconds = histogram(
+            "pose_seconds",
+            "Duration of successful pose requests in seconds.",
+            buckets=LATENCY_BUCKETS,
+        )
+        self._pose_answers = counter(
+            "pose_answers", "Answered pose requests by outcome: found or no_pose.", ["outcome"]
+        )
         self._registry.register(_SnapshotCollector(worker))
 
     def search(self, request: SearchRequest) -> SearchResponse:
@@ -98,6 +111,16 @@ class MeteredSearch:
         matched = sum(each is not None for each in response.candidates)
         self._matched_photos.labels("matched").inc(matched)
         self._matched_photos.labels("without_features").inc(len(request.candidates) - matched)
+        return response
+
+    def estimate_pose(self, request: PoseRequest) -> PoseResponse:
+        """Compute a pose and record whether there is one."""
+        with (
+            _measured(self._poses, self._pose_seconds),
+            span("pose", photos=len(request.candidates)),
+        ):
+            response = self._worker.estimate_pose(request)
+        self._pose_answers.labels("no_pose" if response.pose is None else "found").inc()
         return response
 
     def status(self) -> SearchStatus:

@@ -58,28 +58,22 @@ class PhotoMatcher:
 
     def match(self, request: MatchRequest) -> MatchResponse:
         """See `SearchBackend.match`; Unavailable while the object store can't be read."""
-        none = (None,) * len(request.candidates)
-        query = self._read(request.query)
-        if query is None:
-            reason = "The query has no local features that can be read."
-            return MatchResponse(candidates=none, reason=reason)
-        size = (query[1].width, query[1].height)
-        if len(query[1].positions):
-            found = _match_threads().map(
-                lambda candidate: self._match_pair(query, candidate, request.with_pairs),
-                request.candidates,
-            )
-            return MatchResponse(candidates=tuple(found), query_size=size)
-        if max(size) < MIN_SIDE:
-            reason = f"The longer side of the query is shorter than {MIN_SIDE} pixels."
-        else:
-            reason = "The query has too little texture to find points in it."
-        return MatchResponse(candidates=none, reason=reason, query_size=size)
+        query = self.read_features(request.query)
+        size = None if query is None else (query[1].width, query[1].height)
+        if query is None or not len(query[1].positions):
+            none = (None,) * len(request.candidates)
+            reason = unusable_query_reason(query)
+            return MatchResponse(candidates=none, reason=reason, query_size=size)
+        found = match_threads().map(
+            lambda candidate: self._match_pair(query, candidate, request.with_pairs),
+            request.candidates,
+        )
+        return MatchResponse(candidates=tuple(found), query_size=size)
 
     def _match_pair(
         self, query: ModelFeatures, candidate: FeatureReference, with_pairs: bool
     ) -> PhotoMatches | None:
-        found = self._read(candidate)
+        found = self.read_features(candidate)
         if found is None or found[0] != query[0]:
             return None
         (model, first), second = query, found[1]
@@ -98,7 +92,7 @@ class PhotoMatcher:
             )
         return PhotoMatches(matches=len(matches), inliers=int(is_inlier.sum()), pairs=pairs)
 
-    def _read(self, reference: FeatureReference) -> ModelFeatures | None:
+    def read_features(self, reference: FeatureReference) -> ModelFeatures | None:
         """Return the features of a photo and their model; None if they are missing or damaged."""
         try:
             if reference.object_key.startswith(QUERIES):  # expires with its object
@@ -130,6 +124,16 @@ class PhotoMatcher:
         return value
 
 
+def unusable_query_reason(query: ModelFeatures | None) -> str:
+    """Return why a query that has no keypoints can't be compared with any photo."""
+    if query is None:
+        return "The query has no local features that can be read."
+    if max(query[1].width, query[1].height) < MIN_SIDE:
+        return f"The longer side of the query is shorter than {MIN_SIDE} pixels."
+    return "The query has too little texture to find points in it."
+
+
 @cache
-def _match_threads() -> ThreadPoolExecutor:
+def match_threads() -> ThreadPoolExecutor:
+    """Return the threads that photos are read and matched in."""
     return ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_THREADS), "search-match")

@@ -36,6 +36,8 @@ from shared.ids import new_id
 from shared.search_api.protocol import (
     MatchRequest,
     MatchResponse,
+    PoseRequest,
+    PoseResponse,
     ReplicationLag,
     SearchRequest,
     SearchResponse,
@@ -67,8 +69,8 @@ def create_search_app(worker: SearchWorker, registry: CollectorRegistry | None =
     """Create the HTTP API of a worker, which the caller keeps in sync with the catalog."""
     app = FastAPI(
         title="Placewise search",
-        description=f"Exact cosine top-k on shard {worker.shard} of every map, and matches of "
-        "local features.",
+        description=f"Exact cosine top-k on shard {worker.shard} of every map, matches of local "
+        "features, and poses.",
         responses=PROBLEM_RESPONSES,
     )
     install_exception_handlers(app)
@@ -85,6 +87,12 @@ def create_search_app(worker: SearchWorker, registry: CollectorRegistry | None =
     def match(request: MatchRequest) -> Response:
         """Match the local features of a query with those of photos of any shard."""
         return Response(metrics.match(request).model_dump_json(), media_type="application/json")
+
+    @app.post("/pose", operation_id="estimate_pose", response_model=PoseResponse)
+    def estimate_pose(request: PoseRequest) -> Response:
+        """Compute the pose of a query in a reconstruction of any map."""
+        answer = metrics.estimate_pose(request)
+        return Response(answer.model_dump_json(), media_type="application/json")
 
     # Async like the probes, so that it answers while all threads of the pool are searching.
     @app.get("/status", operation_id="status", response_model=SearchStatus)

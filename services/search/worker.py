@@ -30,6 +30,7 @@ from services.search.chunk_loader import list_generation_folders, remove_stale_f
 from services.search.executor import SearchOptions, execute_query
 from services.search.photo_columns import build_row_mask
 from services.search.photo_matcher import PhotoMatcher
+from services.search.pose_estimator import PoseEstimator
 from services.search.query_batcher import QueryBatcher
 from services.search.residency import MemoryBudget, open_search_gpu
 from services.search.snapshot import Snapshot
@@ -43,6 +44,8 @@ from shared.search_api.background import subtract_background
 from shared.search_api.protocol import (
     MatchRequest,
     MatchResponse,
+    PoseRequest,
+    PoseResponse,
     RowReference,
     SearchRequest,
     SearchResponse,
@@ -187,6 +190,7 @@ class SearchWorker:
         self._memory_budget = MemoryBudget(settings.search_memory_bytes)
         self._query_rows = QueryRowReader(store)
         self._photo_matcher = PhotoMatcher(store)
+        self._pose_estimator = PoseEstimator(store, self._photo_matcher)
         self._snapshots: dict[UUID, Snapshot] = {}
         self._snapshots_lock = threading.Lock()  # never held during I/O
         self._load_locks: dict[UUID, threading.Lock] = {}
@@ -271,6 +275,10 @@ class SearchWorker:
     def match(self, request: MatchRequest) -> MatchResponse:
         """Match local features, of photos of any shard; see `MatchRequest`."""
         return self._photo_matcher.match(request)
+
+    def estimate_pose(self, request: PoseRequest) -> PoseResponse:
+        """Compute a pose, with photos of any shard; see `PoseRequest`."""
+        return self._pose_estimator.estimate(request)
 
     def status(self) -> SearchStatus:
         """Return what is loaded, with sizes and lags."""

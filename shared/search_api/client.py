@@ -29,6 +29,8 @@ from shared.search_api.protocol import (
     NONE,
     MatchRequest,
     MatchResponse,
+    PoseRequest,
+    PoseResponse,
     SearchHit,
     SearchRequest,
     SearchResponse,
@@ -38,6 +40,8 @@ from shared.search_api.workers import REFRESH_SECONDS, WorkerDirectory, WorkerUn
 from shared.telemetry.tracing import REQUEST_ID_HEADER, current_request_id, current_traceparent
 
 log = logging.getLogger(__name__)
+
+Message = TypeVar("Message", bound=BaseModel)
 
 
 def merge_responses(
@@ -195,12 +199,19 @@ class HttpSearchClient:
 
     def match(self, request: MatchRequest) -> MatchResponse:
         """Match local features on one worker; on the next one when it fails."""
+        return self._call_any("match", request, MatchResponse)
+
+    def estimate_pose(self, request: PoseRequest) -> PoseResponse:
+        """Compute a pose on one worker; on the next one when it fails."""
+        return self._call_any("pose", request, PoseResponse)
+
+    def _call_any(self, path: str, request: BaseModel, kind: type[Message]) -> Message:
         deadline = time.monotonic() + self._timeout_seconds
         for url, seconds in _attempts(self._workers.urls(), deadline):
             try:
-                return call_match(self._http, url, request, seconds)
+                return _post(self._http, f"{url}/{path}", request, kind, seconds)
             except WorkerUnavailable as error:
-                log.info("a match request failed, trying the next worker: %s", error)
+                log.info("a %s request failed, trying the next worker: %s", path, error)
                 self._workers.mark_down(url)
         raise Unavailable("search_unavailable", "No search worker answers. Retry in a moment.")
 
@@ -299,7 +310,6 @@ def _collect(
 
 CONNECT_SECONDS = 1.0  # workers are in the same network: a slower one counts as unreachable
 STATUS_TIMEOUT_SECONDS = 2.0  # a worker that answers more slowly gets no queries
-Message = TypeVar("Message", bound=BaseModel)
 
 
 def call_search(
@@ -311,16 +321,18 @@ def call_search(
         WorkerUnavailable: The worker could not be reached, or failed.
         PlacewiseError: As the worker answered it.
     """
-    body = _call(http, "POST", f"{url}/search", timeout_seconds, content=request.model_dump_json())
-    return _read(SearchResponse, url, body)
+    return _post(http, f"{url}/search", request, SearchResponse, timeout_seconds)
 
 
-def call_match(
-    http: httpx2.Client, url: str, request: MatchRequest, timeout_seconds: float
-) -> MatchResponse:
-    """Call `POST /match` of one worker; raises as `call_search` does."""
-    body = _call(http, "POST", f"{url}/match", timeout_seconds, content=request.model_dump_json())
-    return _read(MatchResponse, url, body)
+def _post(
+    http: httpx2.Client,
+    url: str,
+    request: BaseModel,
+    kind: type[Message],
+    timeout_seconds: float,
+) -> Message:
+    body = _call(http, "POST", url, timeout_seconds, content=request.model_dump_json())
+    return _read(kind, url, body)
 
 
 def fetch_status(

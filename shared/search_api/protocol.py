@@ -9,7 +9,7 @@ which spreads a map's slots over shards.
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Protocol
+from typing import Any, Protocol
 from uuid import UUID
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -235,6 +235,97 @@ class MatchResponse(_Message):
     """why the query itself can't be matched; then all candidates are None"""
 
 
+MAX_SEEN_POINTS = 300  # of a pose, spread over its inliers
+
+
+class PoseCandidate(FeatureReference):
+    """The local features of a photo of the map that may show what a query shows."""
+
+    photo_id: UUID
+
+
+class PoseComponent(_Message):
+    """A component of a reconstruction, with what leads from its frame to coordinates."""
+
+    object_key: str
+    alignment: dict[str, Any] | None = None
+    """a `shared.geometry.frames.Alignment` as JSON; None if it is not aligned"""
+    calibration: dict[str, Any] | None = None
+    """a `shared.geometry.radius.PoseCalibration`; None if it could not be measured"""
+
+
+class PoseRequest(_Message):
+    """Request to compute where a query was taken, and in which direction, in a reconstruction."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    query: FeatureReference
+    candidates: tuple[PoseCandidate, ...]
+    """most similar first"""
+    features_model: str
+    """`Detector.model` of the reconstruction; features of another one are left out"""
+    components: tuple[PoseComponent, ...]
+    focal_length: float | None = Field(None, gt=0, allow_inf_nan=False)
+    """as a multiple of the query's longer side; None if it has to be estimated"""
+    camera_source: str
+    """where `focal_length` comes from: a `shared.geometry.cameras.CameraSource`"""
+    leave_out: tuple[UUID, ...] = ()
+    """photos whose own points are not used: the query, if it is one of the map"""
+
+
+class SeenPoint(_Message):
+    """A point of a reconstruction that a query shows."""
+
+    query: tuple[float, float]
+    """in pixels of the upright query"""
+    point: tuple[float, float, float]
+    """in the component's frame"""
+
+
+class GeographicPose(_Message):
+    """A pose on the earth: a `shared.geometry.radius.GeoPose`."""
+
+    latitude: float
+    longitude: float
+    altitude_m: float | None
+    heading: float
+    pitch: float
+    roll: float
+    radius_68_m: float
+    radius_95_m: float
+    heading_68_degrees: float
+
+
+class ComponentPose(_Message):
+    """The pose of a query in the frame of a component: a `shared.geometry.localise.LocalPose`."""
+
+    component: int
+    """index in the request's components"""
+    position: tuple[float, float, float]
+    """centre of the camera"""
+    quaternion: tuple[float, float, float, float]
+    """(w, x, y, z) of the rotation from the component to the camera's axes"""
+    inliers: int
+    matches: int
+    width: int
+    """of the upright query in pixels"""
+    height: int
+    focal_pixels: float
+    camera_source: str
+    seen: tuple[SeenPoint, ...]
+    """at most MAX_SEEN_POINTS of the inliers"""
+    geographic: GeographicPose | None
+    """None if the component is not aligned or not calibrated"""
+
+
+class PoseResponse(_Message):
+    """Result of a pose request."""
+
+    pose: ComponentPose | None = None
+    reason: str | None = None
+    """why there is no pose, as a sentence; None with one"""
+
+
 class SearchBackend(Protocol):
     """The search tier as its callers use it.
 
@@ -246,6 +337,9 @@ class SearchBackend(Protocol):
 
     def match(self, request: MatchRequest) -> MatchResponse:
         """Match local features, on any one worker: they are read from the object store."""
+
+    def estimate_pose(self, request: PoseRequest) -> PoseResponse:
+        """Compute the pose of a query in a reconstruction, on any one worker."""
 
     def status(self) -> SearchStatus:
         """Return the state of the workers."""

@@ -27,6 +27,8 @@ from shared.jobs import Job, JobKind, Priority
 from shared.search_api.protocol import (
     MatchRequest,
     MatchResponse,
+    PoseRequest,
+    PoseResponse,
     SearchBackend,
     SearchRequest,
     SearchResponse,
@@ -135,6 +137,9 @@ class Watched:
 
     def match(self, request: MatchRequest) -> MatchResponse:
         return self.port.match(request)
+
+    def estimate_pose(self, request: PoseRequest) -> PoseResponse:
+        return self.port.estimate_pose(request)
 
     def status(self) -> SearchStatus:
         return self.port.status()

@@ -17,6 +17,8 @@ from shared.catalog.maps import Map
 from shared.search_api.protocol import (
     MatchRequest,
     MatchResponse,
+    PoseRequest,
+    PoseResponse,
     SearchRequest,
     SearchResponse,
     SearchStatus,
@@ -148,6 +150,9 @@ def queried_photos(town: Town, **params: Any) -> list[UUID]:
 
         def match(self, request: MatchRequest) -> MatchResponse:
             return town.search.match(request)
+
+        def estimate_pose(self, request: PoseRequest) -> PoseResponse:
+            return town.search.estimate_pose(request)
 
         def status(self) -> SearchStatus:
             return town.search.status()

@@ -35,6 +35,8 @@ from shared.jobs.transitions import requeue_job
 from shared.search_api.protocol import (
     MatchRequest,
     MatchResponse,
+    PoseRequest,
+    PoseResponse,
     SearchHit,
     SearchRequest,
     SearchResponse,
@@ -72,6 +74,9 @@ class _FakeSearch:
 
     def match(self, request: MatchRequest) -> MatchResponse:
         return MatchResponse(candidates=(None,) * len(request.candidates))
+
+    def estimate_pose(self, request: PoseRequest) -> PoseResponse:
+        return PoseResponse(reason="The query has too little texture to find points in it.")
 
     def status(self) -> SearchStatus:
         return SearchStatus(shard="0/1", rows=0, resident_bytes=0, versions={}, missing=())

@@ -1,0 +1,182 @@
+"""Computes the pose of a query in a reconstruction, whose components are read from the store."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterable
+
+import numpy as np
+from cachetools import LRUCache
+
+from services.search.photo_matcher import PhotoMatcher, match_threads, unusable_query_reason
+from shared.errors import NotFound
+from shared.geometry.cameras import Camera, CameraSource
+from shared.geometry.component import Component, quaternion_of
+from shared.geometry.frames import EastNorthUp, Similarity
+from shared.geometry.localise import LocalPose, NoPose, localise
+from shared.geometry.radius import PoseCalibration, geo_pose
+from shared.matching.features import LocalFeatures
+from shared.matching.matchers import MutualNearest
+from shared.search_api.protocol import (
+    MAX_SEEN_POINTS,
+    ComponentPose,
+    GeographicPose,
+    PoseComponent,
+    PoseRequest,
+    PoseResponse,
+    SeenPoint,
+)
+from shared.storage import ObjectStore
+
+log = logging.getLogger(__name__)
+
+CACHED_COMPONENT_BYTES = 128_000_000  # of 5,000 photos of 1,000 keypoints and 200 points each
+MAX_CANDIDATES = 20  # photos of the components that the query is matched with
+
+
+class PoseEstimator:
+    """Localises queries; thread-safe. `photos` reads the local features."""
+
+    def __init__(self, store: ObjectStore, photos: PhotoMatcher) -> None:
+        self._store = store
+        self._photos = photos
+        self._lock = threading.Lock()
+        self._components: LRUCache[str, Component] = LRUCache(
+            CACHED_COMPONENT_BYTES, getsizeof=_size_bytes
+        )
+
+    def estimate(self, request: PoseRequest) -> PoseResponse:
+        """See `SearchBackend.estimate_pose`; Unavailable while the object store can't be read."""
+        query = self._photos.read_features(request.query)
+        if query is None or not len(query[1].positions):
+            return PoseResponse(reason=unusable_query_reason(query))
+        if query[0] != request.features_model:
+            return PoseResponse(
+                reason=f"The query has local features of {query[0]}, and the reconstruction those "
+                f"of {request.features_model}. Send the photo again, or make a new "
+                "reconstruction: `placewise reconstruct`."
+            )
+        found = [self._read_component(each.object_key) for each in request.components]
+        components = {number: one for number, one in enumerate(found) if one is not None}
+        if not components:
+            return PoseResponse(
+                reason="The reconstruction can't be read: its objects are missing or damaged. Make "
+                "a new one: `placewise reconstruct`."
+            )
+        members = {photo for one in components.values() for photo in one.photo_ids}
+        members -= set(request.leave_out)
+        chosen = [one for one in request.candidates if one.photo_id in members][:MAX_CANDIDATES]
+        read = list(match_threads().map(self._photos.read_features, chosen))
+        candidates = [
+            (candidate.photo_id, features[1])
+            for candidate, features in zip(chosen, read, strict=True)
+            if features is not None and features[0] == request.features_model
+        ]
+        if not candidates:
+            return PoseResponse(
+                reason=f"None of the {len(request.candidates)} most similar photos belongs to the "
+                "reconstruction. It does not cover this place, or photos were added since: add "
+                "them with `placewise reconstruct`."
+            )
+        pose = localise(
+            query[1],
+            candidates,
+            list(components.values()),
+            *_camera(request, query[1], components.values()),
+            MutualNearest.of_model(request.features_model),
+            frozenset(request.leave_out),
+        )
+        if isinstance(pose, NoPose):
+            return PoseResponse(reason=pose.reason)
+        number = list(components)[pose.component]
+        return PoseResponse(pose=_to_message(pose, number, request.components[number]))
+
+    def _read_component(self, key: str) -> Component | None:
+        with self._lock:
+            component = self._components.get(key)
+        if component is not None:
+            return component
+        try:
+            component = Component.decode(self._store.get(key))
+        except NotFound:
+            log.warning("the component %s of a reconstruction is missing", key)
+            return None
+        except ValueError as error:
+            log.warning("the component %s of a reconstruction is damaged: %s", key, error)
+            return None
+        with self._lock:
+            if _size_bytes(component) <= CACHED_COMPONENT_BYTES:
+                self._components[key] = component
+        return component
+
+
+def _size_bytes(component: Component) -> int:
+    arrays = (component.points, component.covariances, component.observations)
+    numbers = sum(each.nbytes for each in component.point_numbers)
+    return 1000 * len(component.photo_ids) + numbers + sum(each.nbytes for each in arrays)
+
+
+def _camera(
+    request: PoseRequest, query: LocalFeatures, components: Iterable[Component]
+) -> tuple[Camera | None, CameraSource]:
+    """Return the camera of the query, if it is known, and where it comes from.
+
+    That of a photo of the reconstruction was refined together with it.
+    """
+    width, height = query.width, query.height
+    if request.focal_length is not None:
+        camera = Camera.of_focal_length(width, height, request.focal_length)
+        return camera, CameraSource(request.camera_source)
+    for component in components:
+        for row, photo_id in enumerate(component.photo_ids):
+            if photo_id in request.leave_out:
+                camera = component.cameras[component.camera_numbers[row]]
+                return camera.resized(width, height), CameraSource.MAP
+    return None, CameraSource.ESTIMATED
+
+
+def _to_message(pose: LocalPose, number: int, component: PoseComponent) -> ComponentPose:
+    count = len(pose.seen_pixels)
+    shown = np.unique(np.linspace(0, count - 1, min(count, MAX_SEEN_POINTS)).astype(int))
+    pixels, points = pose.seen_pixels[shown].round(1), pose.seen_points[shown]
+    return ComponentPose.model_validate(
+        {
+            "component": number,
+            "position": pose.position.tolist(),
+            "quaternion": quaternion_of(pose.rotation).tolist(),
+            "inliers": pose.inliers,
+            "matches": pose.matches,
+            "width": pose.camera.width,
+            "height": pose.camera.height,
+            "focal_pixels": pose.camera.focal_pixels,
+            "camera_source": pose.camera_source,
+            "seen": [
+                SeenPoint(query=pixel, point=point)
+                for pixel, point in zip(pixels.tolist(), points.tolist(), strict=True)
+            ],
+            "geographic": _geographic(pose, component),
+        }
+    )
+
+
+def _geographic(pose: LocalPose, component: PoseComponent) -> GeographicPose | None:
+    if component.alignment is None or component.calibration is None:
+        return None
+    found = geo_pose(
+        pose,
+        EastNorthUp(*component.alignment["origin"]),
+        Similarity.from_json(component.alignment["similarity"]),
+        PoseCalibration.model_validate(component.calibration),
+    )
+    return GeographicPose(
+        latitude=found.latitude,
+        longitude=found.longitude,
+        altitude_m=found.altitude_m,
+        heading=found.attitude.heading,
+        pitch=found.attitude.pitch,
+        roll=found.attitude.roll,
+        radius_68_m=found.radius_68_m,
+        radius_95_m=found.radius_95_m,
+        heading_68_degrees=found.heading_68_degrees,
+    )
