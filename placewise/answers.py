@@ -120,6 +120,48 @@ class Matches(Answer):
     query_height: int | None = None
 
 
+class SeenPoint(Answer):
+    """A point of the map's reconstruction, and the pixel of the upright query that shows it."""
+
+    query: tuple[float, float]
+    point: tuple[float, float, float]
+
+
+class PoseCamera(Answer):
+    """The camera of a pose; `source` is given, exif, map or estimated."""
+
+    focal_pixels: float
+    width: int
+    height: int
+    source: str
+
+
+class CameraPose(Answer):
+    """Where the camera of a query stood and looked. Coordinates are WGS 84, angles in degrees.
+
+    `reason` says why they or the radii are None. `position` and `quaternion` (w, x, y, z) are those
+    of the component of the reconstruction.
+    """
+
+    latitude: float | None
+    longitude: float | None
+    altitude_m: float | None
+    heading: float | None
+    pitch: float | None
+    roll: float | None
+    radius_68_m: float | None
+    radius_95_m: float | None
+    heading_68_degrees: float | None
+    reason: str | None
+    component: int
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+    inliers: int
+    matches: int
+    camera: PoseCamera
+    seen: list[SeenPoint]
+
+
 class EstimateLevel(Answer):
     """A level of an estimate: a place, or a circle around a position."""
 
@@ -164,6 +206,9 @@ class Similar(Answer):
     estimate: Estimate
     matches: Matches | None = None
     """None if no photo was to be matched."""
+    pose: CameraPose | None = None
+    no_pose: str | None = None
+    """Why the query has no pose; None with one, and without `pose=True`."""
     vocabulary: str
     word_weights: str
     generation_id: UUID

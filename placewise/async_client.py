@@ -125,6 +125,8 @@ class AsyncClient(AsyncTransport):
         matches: int | None = None,
         rerank: int | None = None,
         explain: bool = False,
+        pose: bool = False,
+        focal_length: float | None = None,
         wait_seconds: int = 60,
         **filters: Any,
     ) -> answers.Similar:
@@ -138,6 +140,9 @@ class AsyncClient(AsyncTransport):
                 50; each of them has `inliers`. By default, the map decides.
             rerank: Number of first results to match and to order by their inliers.
             explain: Add the matching points (`pairs`) to the results that are matched.
+            pose: Compute where the camera stood and looked, with radii; takes a reconstruction.
+            focal_length: Focal length of the camera as a multiple of the photo's longer side; by
+                default that of the EXIF, or else it is estimated.
             wait_seconds: How long the server may hold the call (`Prefer: wait`) before the client
                 polls the job instead.
             filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
@@ -154,6 +159,8 @@ class AsyncClient(AsyncTransport):
                 matches=matches,
                 rerank=rerank,
                 explain=explain or None,
+                pose=pose or None,
+                focal_length=focal_length,
                 **filters,
             ),
             "headers": {"Prefer": f"wait={wait_seconds}"},

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.progress_bar import ProgressBar
 from rich.table import Column
 
-from placewise.answers import Estimate, EstimateLevel, Matches, Similar
+from placewise.answers import CameraPose, Estimate, EstimateLevel, Matches, Similar
 from placewise.client import Client
 from services.cli.client import connect, describe_target
 from services.cli.output import (
@@ -94,6 +94,19 @@ def query(
             "points.",
         ),
     ] = None,
+    pose: Annotated[
+        bool,
+        typer.Option("--pose", help="Compute where the camera stood and looked, and how exactly."),
+    ] = False,
+    focal_length: Annotated[
+        float | None,
+        typer.Option(
+            min=0.1,
+            max=100,
+            help="With --pose: focal length of the camera as a multiple of the photo's longer "
+            "side. Default: that of the EXIF, or else it is estimated.",
+        ),
+    ] = None,
     certainty: Annotated[
         float | None,
         typer.Option(
@@ -118,6 +131,8 @@ def query(
             matches=matches,
             rerank=rerank,
             explain=explain is not None,
+            pose=pose,
+            focal_length=focal_length,
             near=near,
             box=box,
             captured_after=captured_after,
@@ -167,6 +182,10 @@ def query(
         print_message(_format_estimate(answer.estimate))
     if answer.matches:
         print_message(_format_matches(answer.matches))
+    if answer.no_pose is not None:
+        print_message(f"No pose: {answer.no_pose}")
+    if answer.pose:
+        print_table(_pose_table(answer.pose))
     print_message(
         f"{answer.rows_scanned} photos compared (certificate: {answer.certificate}), "
         f"vocabulary: {answer.vocabulary}, word weights: {answer.word_weights}\n"
@@ -211,6 +230,32 @@ def _draw_matches(client: Client, photo: Path, answer: Similar, out: Path) -> No
         )
     with atomic_write(out) as file:
         match_drawing.stack(drawings).save(file, "PNG")
+
+
+def _pose_table(pose: CameraPose) -> Table:
+    """Name and value of what is known about a pose."""
+    camera = pose.camera
+    table = Table("pose", Column("value", overflow="fold"), caption=pose.reason)
+    for name, value, unit, digits in (
+        ("latitude", pose.latitude, "", 7),
+        ("longitude", pose.longitude, "", 7),
+        ("altitude", pose.altitude_m, " m", 2),
+        ("68 % within", pose.radius_68_m, " m", 2),
+        ("95 % within", pose.radius_95_m, " m", 2),
+        ("heading", pose.heading, "°", 1),
+        ("heading, 68 % within", pose.heading_68_degrees, "°", 1),
+        ("pitch", pose.pitch, "°", 1),
+        ("roll", pose.roll, "°", 1),
+    ):
+        if value is not None:
+            table.add_row(name, f"{value:.{digits}f}{unit}")
+    table.add_row("in component", str(pose.component))
+    table.add_row("x, y, z", ", ".join(f"{value:.4f}" for value in pose.position))
+    table.add_row("points", f"{pose.inliers} of {pose.matches} agree")
+    table.add_row(
+        "focal length", f"{camera.focal_pixels:.0f} of {camera.width} px, {camera.source}"
+    )
+    return table
 
 
 def _format_score(value: float | None) -> str:

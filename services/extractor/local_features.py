@@ -108,11 +108,12 @@ def prepare_features(
 
 
 def _is_matched(job: Job, uses_matches: bool | None) -> bool:
-    """Return whether the search of a query photo will match it."""
+    """Return whether the search of a query photo will match it, or compute its pose."""
     params: dict[str, Any] = job.params.get("search_params", {})
     by_default = uses_matches or params.get("explain")
     matches = params.get("matches")
-    return bool(params.get("rerank") or (by_default if matches is None else matches))
+    is_matched = params.get("rerank") or (by_default if matches is None else matches)
+    return bool(is_matched or params.get("pose"))
 
 
 def read_stored_features(

@@ -20,7 +20,7 @@ from shared.catalog.maps import DEFAULT_MAP
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.vocabularies import VocabularyOrigin
 from shared.jobs import Job, JobKind, JobState
-from shared.search_api.protocol import PointPair
+from shared.search_api.protocol import PointPair, SeenPoint
 
 
 class RequestModel(BaseModel):
@@ -197,6 +197,61 @@ class EstimateResponse(ResponseModel):
     )
 
 
+class PoseCameraResponse(ResponseModel):
+    """The camera that a pose was computed with."""
+
+    focal_pixels: float = Field(description="focal length in pixels of the upright photo")
+    width: int = Field(description="of the upright photo in pixels, to draw `seen`")
+    height: int
+    source: str = Field(
+        description="where the focal length comes from: `given` with the request, `exif` of the "
+        "photo, `map`: of the same photo in the reconstruction, or `estimated` with the pose"
+    )
+
+
+class CameraPoseResponse(ResponseModel):
+    """Where the camera of the query stood, where it looked, and how far off that may be."""
+
+    latitude: float | None = Field(
+        description="degrees, WGS 84; null if the component has no coordinates (`reason`)"
+    )
+    longitude: float | None
+    altitude_m: float | None = Field(
+        description="metres, as the altitudes of the map's photos; null if too few have one"
+    )
+    heading: float | None = Field(
+        description="viewing direction, degrees clockwise from north, in [0, 360)"
+    )
+    pitch: float | None = Field(description="degrees that the camera looks up, in [-90, 90]")
+    roll: float | None = Field(
+        description="degrees that the camera is turned clockwise about its viewing direction"
+    )
+    radius_68_m: float | None = Field(
+        description="radius in metres that contains the true position with a probability of 68 %, "
+        "calibrated on the map's own photos; null with a `reason`"
+    )
+    radius_95_m: float | None = Field(description="the same with 95 %")
+    heading_68_degrees: float | None = Field(
+        description="the true heading differs by at most this with a probability of 68 %"
+    )
+    reason: str | None = Field(description="why fields above are null; null if none is missing")
+    component: int = Field(description="number of the component in the reconstruction")
+    position: tuple[float, float, float] = Field(
+        description="centre of the camera in the component's frame"
+    )
+    quaternion: tuple[float, float, float, float] = Field(
+        description="w, x, y, z of the rotation from the component's frame to the camera, whose "
+        "axes are x to the right, y down and z forward, as in COLMAP"
+    )
+    inliers: int = Field(description="number of points that agree with the pose")
+    matches: int = Field(description="number of points that were matched")
+    camera: PoseCameraResponse
+    seen: list[SeenPoint] = Field(
+        description="at most 300 of the points that agree: pixel in the upright query (`query`) "
+        "and position in the component's frame (`point`)"
+    )
+
+
 class SimilarityResponse(ResponseModel):
     """The most similar photos, best first, without the query itself."""
 
@@ -212,6 +267,12 @@ class SimilarityResponse(ResponseModel):
     )
     estimate: EstimateResponse
     matches: MatchesResponse | None = Field(None, description="null if no photo was to be matched")
+    pose: CameraPoseResponse | None = Field(
+        None, description="with `pose=true`; null if the query has none (`no_pose`)"
+    )
+    no_pose: str | None = Field(
+        None, description="with `pose=true`: why the query has no pose; null with one"
+    )
     vocabulary: str = Field(
         description="`own`: fitted on this map's photos; `provisional`: fitted on fewer than 50 of "
         "them; `foreign`: fitted on other photos; `pending`: descriptors are GeM-pooled until the "

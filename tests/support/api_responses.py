@@ -134,3 +134,22 @@ MAP: dict[str, Any] = {
     "rows": "float16",
     "created_at": TIME,
 }
+POSE: dict[str, Any] = {
+    "latitude": 45.0692801,
+    "longitude": 7.6853,
+    "altitude_m": 241.5,
+    "heading": 338.04,
+    "pitch": -1.5,
+    "roll": 0.25,
+    "radius_68_m": 0.42,
+    "radius_95_m": 0.9,
+    "heading_68_degrees": 1.25,
+    "reason": None,
+    "component": 1,
+    "position": [0.41, 0.6, -0.1],
+    "quaternion": [1.0, 0.0, 0.0, 0.0],
+    "inliers": 148,
+    "matches": 312,
+    "camera": {"focal_pixels": 1043.6, "width": 1280, "height": 960, "source": "exif"},
+    "seen": [{"query": [640.0, 240.0], "point": [1.0, 2.0, 3.0]}],
+}

@@ -23,6 +23,7 @@ from services.gateway.dependencies import (
 from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
 from services.gateway.schemas import JobAcceptedResponse, SimilarityResponse
 from services.gateway.similarity.execute import find_similar, query_from_job, query_from_photo
+from services.gateway.similarity.geopose import GEOPOSE, GeoPoseDep, with_geopose
 from services.gateway.similarity.matches import check_matching_enabled
 from services.gateway.similarity.search_params import SearchParams, SimilarityParams
 from services.gateway.uploads.multipart import FormFile, multipart_schema
@@ -55,23 +56,30 @@ ERROR_BY_STATUS = {kind.status: kind for kind in (NotFound, Conflict, Gone)}
 @router.post(
     "/similarity/{file_id}",
     operation_id="similar_to_stored",
+    response_model=SimilarityResponse,
+    responses=GEOPOSE,
     dependencies=[READ],
 )
 def search_by_stored_photo(
     gateway: GatewayDep,
     file_id: Annotated[FileId, PathParameter(description="a stored photo")],
     query: Annotated[SimilarityParams, Query()],
-) -> SimilarityResponse:
-    """Find the photos most similar to a stored photo, without that photo."""
-    search_params = query.search_params()
-    return find_similar(gateway, query_from_photo(gateway, query.map, file_id), search_params)
+    geopose: GeoPoseDep,
+) -> Any:
+    """Find the photos most similar to a stored photo, without that photo.
+
+    With `Accept: application/geopose+json`, the response is the photo's pose as OGC GeoPose.
+    """
+    search_params = query.search_params(with_pose=geopose)
+    answer = find_similar(gateway, query_from_photo(gateway, query.map, file_id), search_params)
+    return with_geopose(answer, search_params, geopose)
 
 
 @router.post(
     "/similarity",
     operation_id="similar_to_upload",
     response_model=SimilarityResponse,
-    responses=JOB_PENDING,
+    responses=JOB_PENDING | GEOPOSE,
     openapi_extra=multipart_schema("the query photo"),
     dependencies=[READ, ADMIT_QUERY],
 )
@@ -82,14 +90,16 @@ async def search_by_uploaded_photo(
     idempotent: IdempotentFormDep,
     admission: AdmissionDep,
     query: Annotated[SimilarityParams, Query()],
+    geopose: GeoPoseDep,
 ) -> Any:
     """Find the photos most similar to an uploaded photo that is not stored.
 
     The response is 202 with a job: poll `status_url`, then GET `result_url`. With `Prefer: wait=N`
     it is 200 with the result if that takes at most N seconds. A request repeated with its
-    `Idempotency-Key` gets the 202 of the first one.
+    `Idempotency-Key` gets the 202 of the first one. With `Accept: application/geopose+json`, the
+    result is the photo's pose as OGC GeoPose.
     """
-    search_params = query.search_params()
+    search_params = query.search_params(with_pose=geopose)
     async with receive_query_photo(request, gateway, admission) as (job_id, file):
         job = await run_in_threadpool(
             _queue_query, gateway, query.map, job_id, file, search_params, idempotent
@@ -103,17 +113,19 @@ async def search_by_uploaded_photo(
         job = described
     if job.state in UNFINISHED_STATES:
         return JobAcceptedResponse.of(job, query.map).to_http(response.headers)
-    return await run_in_threadpool(_result_of, gateway, job)
+    return await run_in_threadpool(_result_of, gateway, job, geopose)
 
 
 @router.get(
     "/jobs/{job_id}/result",
     operation_id="similarity_result",
+    response_model=SimilarityResponse,
+    responses=GEOPOSE,
     dependencies=[READ],
 )
 def read_similarity_result(
-    gateway: GatewayDep, job_id: JobId, query: MapQuery
-) -> SimilarityResponse:
+    gateway: GatewayDep, job_id: JobId, query: MapQuery, geopose: GeoPoseDep
+) -> Any:
     """Get the result of a succeeded query job; 409 while it is unfinished."""
     with gateway.catalog.read() as session:
         job = get_job(session, get_map(session, query.map).id, job_id)
@@ -126,7 +138,7 @@ def read_similarity_result(
             job_id=str(job.id),
             state=job.state,
         )
-    return _result_of(gateway, job)
+    return _result_of(gateway, job, geopose)
 
 
 @router.get(
@@ -168,20 +180,24 @@ def _queue_query(
         for name in upload.fields:
             raise invalid_field_error(name, "is unknown; send filters as query parameters")
         with upload.open(gateway.store) as photo:
-            read_photo_header(photo, gateway.settings.max_image_pixels)
+            header = read_photo_header(photo, gateway.settings.max_image_pixels)
         with gateway.catalog.write() as session:
             map_ = get_map(session, map_name)
             check_matching_enabled(map_, search_params)
-            job = describe_query_job(job_id, map_.id, upload.filename, search_params)
+            job = describe_query_job(
+                job_id, map_.id, upload.filename, search_params, header.focal_length
+            )
             idempotent.store_job_response(session, job)
     gateway.wakeups.send(WakeupQueue.QUERY)
     return job
 
 
-def _result_of(gateway: GatewayContext, job: Job) -> SimilarityResponse:
+def _result_of(gateway: GatewayContext, job: Job, geopose: bool) -> Any:
     """The result of a finished query job."""
     if job.state == JobState.SUCCEEDED:
-        return find_similar(gateway, query_from_job(gateway, job), query_job_search_params(job))
+        search_params = query_job_search_params(job)
+        answer = find_similar(gateway, query_from_job(gateway, job), search_params)
+        return with_geopose(answer, search_params, geopose)
     if job.state == JobState.CANCELLED:
         raise Conflict("job_cancelled", f"The job {job.id} was cancelled.", job_id=str(job.id))
     error = job.error or {}

@@ -324,7 +324,7 @@ def _accept_frame(
     with idempotent.claim_form(received, QUERY_TTL_SECONDS):
         form = parse_frame_form(received.fields)
         with received.open(gateway.store) as photo:
-            read_photo_header(photo, gateway.settings.max_image_pixels)
+            header = read_photo_header(photo, gateway.settings.max_image_pixels)
         with reserve_photo_quota(request, gateway.settings), gateway.catalog.write() as session:
             track = get_track(session, get_map(session, map_name).id, track_id, lock=True)
             frame = TrackFrame(
@@ -341,8 +341,15 @@ def _accept_frame(
             )
             stored = add_frame(session, track, frame, form.expected_version)
             if stored is frame:
-                unmatched = SearchParams(matches=0)
-                session.add(describe_query_job(job_id, track.map_id, received.filename, unmatched))
+                session.add(
+                    describe_query_job(
+                        job_id,
+                        track.map_id,
+                        received.filename,
+                        SearchParams(matches=0),
+                        header.focal_length,
+                    )
+                )
             response = _frame_response(stored, map_name)
             headers = accepted_headers(response.frame_url)
             idempotent.store_response(session, 202, response, headers)

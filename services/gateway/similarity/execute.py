@@ -20,6 +20,7 @@ from sqlalchemy.orm import Session
 
 from services.gateway.dependencies import GatewayContext
 from services.gateway.schemas import (
+    CameraPoseResponse,
     EstimateResponse,
     SimilarityResponse,
     SimilarPhotoResponse,
@@ -33,6 +34,7 @@ from services.gateway.similarity.matches import (
     check_matching_enabled,
     match_photos,
 )
+from services.gateway.similarity.pose import estimate_camera_pose
 from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import find_descriptor
 from shared.catalog.database.errors import to_unavailable
@@ -44,6 +46,7 @@ from shared.errors import Conflict, Gone, StorageFull
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH, RankedPhoto
 from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import PlaceModel
+from shared.geometry.cameras import CameraSource
 from shared.jobs import Job, JobState
 from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
 from shared.search_api.protocol import (
@@ -105,6 +108,8 @@ class SimilarityQuery:
     row: int
     photo_id: UUID | None
     filename: str
+    focal_length: float | None = None
+    """From the photo's EXIF, as a multiple of its longer side; None if it is not known"""
     background: tuple[RowReference, ...] = ()
     """Descriptors whose mean is subtracted from the query"""
 
@@ -137,6 +142,7 @@ def query_from_photo(gateway: GatewayContext, map_name: str, photo_id: UUID) -> 
             row=descriptor.row,
             photo_id=photo.id,
             filename=photo.filename,
+            focal_length=photo.focal_length,
         )
 
 
@@ -162,6 +168,7 @@ def query_from_job(gateway: GatewayContext, job: Job) -> SimilarityQuery:
             row=result["row"],
             photo_id=None,
             filename=job.params["filename"],
+            focal_length=job.params.get("focal_length"),
         )
 
 
@@ -198,7 +205,7 @@ def find_similar(
 def run_similarity_search(
     gateway: GatewayContext, query: SimilarityQuery, search_params: SearchParams
 ) -> tuple[SimilarityResponse, Search]:
-    """Rank the photos, match the best ones, estimate the place, and make response and history row.
+    """Rank the photos, match the best ones, estimate place and pose, make response and history row.
 
     One search answers most queries. Further ones are made for photos without a place among the
     first, for a filter (the estimate is that of the whole map), for the neighbours of a best photo
@@ -211,6 +218,7 @@ def run_similarity_search(
     rankings = _rank_photos(search, search_params)
     matches = _match_best_photos(search, rankings, search_params)
     estimate, probabilities = _estimate(search, rankings, matches, weights, search_params)
+    pose = find_pose(gateway, query, rankings.found.hits, search_params)
     similar = rankings.similar
     hits = matches.rerank(similar.hits, search_params.rerank or 0)[: search_params.top_k]
     response = SimilarityResponse.of_row(
@@ -222,6 +230,8 @@ def run_similarity_search(
         similar_images=[],
         estimate=estimate,
         matches=matches.response,
+        pose=None if isinstance(pose, str) else pose,
+        no_pose=pose if isinstance(pose, str) else None,
         vocabulary=query.vocabulary,
         word_weights=weights.state(rankings.found.hits),
         generation_id=query.generation.id,
@@ -375,6 +385,32 @@ def _match_best_photos(
     photo_ids = dict.fromkeys(hit.photo_id for ranking in best for hit in ranking.hits[:count])
     return match_photos(
         search.gateway, query.generation, query.features, list(photo_ids), search_params.explain
+    )
+
+
+def find_pose(
+    gateway: GatewayContext,
+    query: SimilarityQuery,
+    hits: Sequence[SearchHit],
+    search_params: SearchParams,
+) -> CameraPoseResponse | str | None:
+    """Return the pose of a query, or why it has none; None if it was not requested.
+
+    Args:
+        hits: The most similar photos, best first.
+    """
+    if not search_params.pose:
+        return None
+    source = CameraSource.ESTIMATED if query.focal_length is None else CameraSource.EXIF
+    return estimate_camera_pose(
+        gateway,
+        query.map,
+        query.generation,
+        query.features,
+        [hit.photo_id for hit in hits],
+        search_params.focal_length or query.focal_length,
+        CameraSource.GIVEN if search_params.focal_length else source,
+        query.photo_id,
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from datetime import datetime
+from enum import StrEnum
 from uuid import UUID
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -134,6 +135,13 @@ def _parse_ids(text: str) -> tuple[UUID, ...]:
     return tuple(ids)
 
 
+class GeoPoseForm(StrEnum):
+    """Form of a GeoPose."""
+
+    QUATERNION = "quaternion"
+    YPR = "ypr"
+
+
 class RankingParams(BaseModel):
     """Number of results of a similarity search, ranking, and limits of its cost."""
 
@@ -161,6 +169,23 @@ class RankingParams(BaseModel):
     )
     explain: bool = Field(
         False, description="Return the matching points of each photo that was matched."
+    )
+    pose: bool = Field(
+        False,
+        description="Compute where the camera stood and looked. Takes a reconstruction of the map; "
+        "otherwise `no_pose` says what is missing.",
+    )
+    focal_length: float | None = Field(
+        None,
+        ge=0.1,
+        le=100,
+        description="Focal length of the query's camera, as a multiple of the photo's longer side "
+        "(that for 35 mm film, divided by 36). Default: that of the EXIF, or else it is estimated.",
+    )
+    geopose: GeoPoseForm = Field(
+        GeoPoseForm.QUATERNION,
+        description="Form of the answer to `Accept: application/geopose+json`: Basic-Quaternion or "
+        "Basic-YPR of OGC GeoPose 1.0.",
     )
     certainty: float | None = Field(
         None,
@@ -198,7 +223,8 @@ class SearchParams(RankingParams):
 class SimilarityParams(RankingParams, FilterParams):
     """Query parameters of the similarity searches."""
 
-    def search_params(self) -> SearchParams:
-        """Parse the filter; raises as `photo_filter`."""
+    def search_params(self, *, with_pose: bool = False) -> SearchParams:
+        """Parse the filter; raises as `photo_filter`. `with_pose` asks for the pose, too."""
         ranking = self.model_dump(include=set(RankingParams.model_fields))
+        ranking["pose"] |= with_pose
         return SearchParams(photos=self.photo_filter(), **ranking)

@@ -40,15 +40,26 @@ async def receive_query_photo(
 
 
 def describe_query_job(
-    job_id: UUID, map_id: UUID, filename: str, search_params: SearchParams
+    job_id: UUID,
+    map_id: UUID,
+    filename: str,
+    search_params: SearchParams,
+    focal_length: float | None,
 ) -> Job:
-    """Create the job that describes a query photo and keeps the parameters of its search."""
+    """Create the job that describes a query photo and keeps the parameters of its search.
+
+    `focal_length` is that of its header, as a multiple of the longer side.
+    """
     return Job(
         id=job_id,
         map_id=map_id,
         kind=JobKind.DESCRIBE,
         priority=Priority.QUERY,
-        params={"filename": filename, "search_params": search_params.model_dump(mode="json")},
+        params={
+            "filename": filename,
+            "search_params": search_params.model_dump(mode="json"),
+            "focal_length": focal_length,
+        },
     )
 
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from services.cli.match_drawing import CAPTION, GAP
 from services.cli.query import query as query_command
-from tests.support.api_responses import PHOTO, SIMILAR
+from tests.support.api_responses import PHOTO, POSE, SIMILAR
 from tests.support.fake_server import FakeServer, running_server
 from tests.support.photos import encoded
 
@@ -45,17 +45,28 @@ def estimate(levels: list[dict[str, Any]], **fields: Any) -> dict[str, Any]:
     }
 
 
-def query(folder: Path, answer: dict[str, Any], *options: str, **photo: Any) -> tuple[str, str]:
-    """The output of the command for an answer of the server, and the path of its request."""
+def query(
+    folder: Path,
+    answer: dict[str, Any],
+    *options: str,
+    pose: dict[str, Any] | None = None,
+    in_terminal: bool = True,
+    **photo: Any,
+) -> tuple[str, str]:
+    """The output of the command for an answer of the server, and the path of its request.
+
+    `pose` are the fields of the answer about the pose.
+    """
     (folder / "where.jpg").write_bytes(b"photo")
     match = {**PHOTO, "similarity_score": 0.8, **photo}
     server: FakeServer
     with running_server() as server:
-        server.will_answer(200, {**SIMILAR, "similar_images": [match], "estimate": answer})
+        found = {"similar_images": [match], "estimate": answer, **(pose or {})}
+        server.will_answer(200, {**SIMILAR, **found})
         shown = CliRunner().invoke(
             app,
             [str(folder / "where.jpg"), "--server", server.url, *options],
-            env={"TTY_COMPATIBLE": "1", "COLUMNS": "80"},
+            env={"TTY_COMPATIBLE": str(int(in_terminal)), "COLUMNS": "80"},
         )
     assert shown.exit_code == 0, shown.output
     return shown.stdout, server.requests[0][1]
@@ -146,6 +157,45 @@ def test_without_an_answer_one_sentence_gives_the_reason(
 def test_the_certainty_is_sent_to_the_server(tmp_path: Path) -> None:
     _, path = query(tmp_path, estimate(PLACES), "--certainty", "0.8")
     assert parse_qs(urlsplit(path).query)["certainty"] == ["0.8"]
+
+
+def test_a_pose_is_a_table_of_80_columns_and_tab_separated_values_in_a_pipe(
+    tmp_path: Path,
+) -> None:
+    options = ("--pose", "--focal-length", "0.8")
+    place: dict[str, Any] = {"reason": "No place is known."}
+    shown, path = query(tmp_path, place, *options, pose={"pose": POSE, "no_pose": None})
+    sent = parse_qs(urlsplit(path).query)
+    assert (sent["pose"], sent["focal_length"]) == (["true"], ["0.8"])
+    rows = [" ".join(row.split()) for row in shown.splitlines()]
+    for row in (
+        "latitude 45.0692801",
+        "altitude 241.50 m",
+        "68 % within 0.42 m",
+        "heading 338.0°",
+        "heading, 68 % within 1.2°",
+        "x, y, z 0.4100, 0.6000, -0.1000",
+        "points 148 of 312 agree",
+        "focal length 1044 of 1280 px, exif",
+    ):
+        assert row in rows
+    assert max(len(row) for row in shown.splitlines() if not row.endswith(".")) <= 80
+    piped, _ = query(tmp_path, place, pose={"pose": POSE, "no_pose": None}, in_terminal=False)
+    assert "pose\tvalue\nlatitude\t45.0692801\nlongitude\t7.6853000\n" in piped
+
+
+def test_missing_coordinates_and_poses_are_explained(tmp_path: Path) -> None:
+    place: dict[str, Any] = {"reason": "No place is known."}
+    fields = dict.fromkeys(name for name in POSE if name.endswith(("_m", "itude", "_degrees")))
+    pose = {**POSE, **fields, "heading": None, "reason": "All photos are on a line."}
+    shown, path = query(tmp_path, place, pose={"pose": pose, "no_pose": None})
+    assert "All photos are on a line." in " ".join(shown.split())
+    assert "latitude 45" not in " ".join(shown.split())
+    assert "within" not in shown
+    assert "pose" not in path
+    reason = "The map has no reconstruction yet. Make one: `placewise reconstruct`."
+    shown, _ = query(tmp_path, place, "--pose", pose={"pose": None, "no_pose": reason})
+    assert f"No pose: {reason}" in shown.splitlines()
 
 
 def test_an_answer_without_levels_has_neither_bars_nor_match_probabilities(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from services.gateway import schemas
 from services.gateway.routes import batches, evaluations, keys, maps, models, positions, tracks
 from services.gateway.routes import stats as stats_module
 from services.gateway.tracks.schemas import TrackStateResponse
-from shared.search_api.protocol import PointPair
+from shared.search_api.protocol import PointPair, SeenPoint
 from tests.support.api_responses import JOB, PHOTO, SIMILAR, STARTED, UPLOADED
 from tests.support.fake_server import FakeServer
 
@@ -34,6 +34,9 @@ SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
     (answers.Estimate, schemas.EstimateResponse),
     (answers.Matches, schemas.MatchesResponse),
     (answers.PointPair, PointPair),
+    (answers.CameraPose, schemas.CameraPoseResponse),
+    (answers.PoseCamera, schemas.PoseCameraResponse),
+    (answers.SeenPoint, SeenPoint),
     (answers.TrackState, TrackStateResponse),
     (answers.Track, tracks.TrackResponse),
     (answers.OneTrack, tracks.TrackDetailResponse),

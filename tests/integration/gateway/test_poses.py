@@ -1,0 +1,302 @@
+"""Poses over HTTP: coordinates with radii, why there is none, and OGC GeoPose."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from dataclasses import replace
+from io import BytesIO
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+import pytest
+from PIL import Image
+from PIL.ExifTags import IFD, Base
+
+from services.gateway.schemas import CameraPoseResponse
+from services.gateway.similarity.geopose import MEDIA_TYPE, geopose
+from services.gateway.similarity.search_params import GeoPoseForm
+from shared.catalog.chunks import Chunk
+from shared.catalog.generations import Generation
+from shared.catalog.maps import Map, Matching
+from shared.catalog.photos import Photo
+from shared.catalog.reconstructions import ReconstructedComponent
+from shared.errors import NotFound, Unavailable
+from shared.geodesy import distance_m
+from shared.geometry.component import quaternion_of
+from shared.geometry.frames import (
+    attitude_of,
+    geopose_angles,
+    geopose_rotation,
+    rotation_of_vector,
+)
+from shared.matching.features import LocalFeatures
+from shared.storage.keys import query_features_key
+from tests.integration.in_process_api import Service
+from tests.support.catalog_rows import add_reconstruction
+from tests.support.local_features import MODEL, add_features, put_features, scene_features
+from tests.support.photos import encoded, photo_bytes
+from tests.support.poses import (
+    ALIGNMENT,
+    CALIBRATION,
+    CENTRE,
+    HEADING,
+    ORIGIN,
+    SIMILARITY,
+    TURN_DEGREES,
+    take_query,
+)
+from tests.support.problems import problem
+from tests.support.reconstructed_scene import CAMERA, ReconstructedScene
+
+pytestmark = pytest.mark.databases("sqlite")
+NOT_ALIGNED = "2 of its photos have coordinates, and 3 are needed."
+
+
+@pytest.fixture
+def scene() -> ReconstructedScene:
+    return ReconstructedScene()
+
+
+@pytest.fixture
+def ids(service: Service, scene: ReconstructedScene) -> list[str]:
+    """The photos of the scene, and one of another place; they have no reconstruction yet."""
+    ids = service.indexed(*range(scene.photos + 1))
+    features = [*scene.features.values(), scene_features(1)]
+    photos = dict(zip(map(UUID, ids), features, strict=True))
+    add_features(service.catalog, service.store, photos)
+    return ids
+
+
+def reconstruct(
+    service: Service, scene: ReconstructedScene, ids: list[str], **columns: Any
+) -> None:
+    """The scene as reconstruction of the first photos; `columns` are of its component."""
+    photo_ids = tuple(map(UUID, ids[: scene.photos]))
+    data = replace(scene.component, photo_ids=photo_ids).encode()
+    key = "reconstructions/1/0.npz"
+    service.store.put(key, data)
+    values = {"alignment": ALIGNMENT, "calibration": CALIBRATION, **columns}
+    component = ReconstructedComponent(
+        number=0,
+        object_key=key,
+        sha256={key: hashlib.sha256(data).hexdigest()},
+        photos=scene.photos,
+        points=scene.points,
+        mean_reprojection_error_pixels=0.5,
+        **values,
+    )
+    with service.catalog.write() as session:
+        add_reconstruction(
+            session,
+            service.store,
+            session.query(Generation).one(),
+            features_model=MODEL,
+            components=[component.model_dump(mode="json")],
+        )
+
+
+def described(
+    service: Service, features: LocalFeatures, photo: bytes | None = None, **params: Any
+) -> str:
+    """The job of a described new photo that has these local features."""
+    job_id = service.ask(photo or photo_bytes(0), **params)
+    service.drain()
+    key = query_features_key(UUID(job_id))
+    service.store.delete(key)
+    put_features(service.store, features, key=key)
+    return job_id
+
+
+def ask(service: Service, features: LocalFeatures, **params: Any) -> dict[str, Any]:
+    job_id = described(service, features, **({"pose": "true"} | params))
+    answer: dict[str, Any] = service.json("GET", f"/jobs/{job_id}/result")
+    return answer
+
+
+def test_pose_has_coordinates_radii_the_camera_and_the_points_that_were_seen(
+    service: Service, scene: ReconstructedScene, ids: list[str]
+) -> None:
+    reconstruct(service, scene, ids)
+    answer = ask(service, take_query(scene), focal_length=CAMERA.focal_length)
+    assert answer["no_pose"] is None
+    pose = answer["pose"]
+    place = ORIGIN.to_geographic(SIMILARITY.apply(CENTRE))
+    away = distance_m(place.latitude, place.longitude, pose["latitude"], pose["longitude"])
+    assert away < 0.15
+    assert pose["altitude_m"] == pytest.approx(place.altitude_m, abs=0.1)
+    assert pose["heading"] == pytest.approx((HEADING - TURN_DEGREES) % 360, abs=0.3)
+    assert 0 < pose["radius_68_m"] < pose["radius_95_m"] < 0.5
+    assert 0 < pose["heading_68_degrees"] < 1
+    assert (pose["component"], pose["reason"]) == (0, None)
+    assert np.linalg.norm(np.array(pose["position"]) - CENTRE) < 0.05
+    assert pose["camera"]["source"] == "given"
+    assert (pose["camera"]["width"], pose["camera"]["height"]) == (CAMERA.width, CAMERA.height)
+    assert 50 < len(pose["seen"]) <= pose["inliers"] <= pose["matches"]
+    without = ask(service, take_query(scene), pose="false")
+    assert (without["pose"], without["no_pose"]) == (None, None)
+
+
+def test_focal_length_is_that_of_the_exif_of_a_query_and_of_a_stored_photo(
+    service: Service, scene: ReconstructedScene, ids: list[str]
+) -> None:
+    reconstruct(service, scene, ids)
+    exif = Image.Exif()
+    exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = round(36 * CAMERA.focal_length)
+    photo = Image.open(BytesIO(photo_bytes(0)))
+    job_id = described(service, take_query(scene), encoded(photo, "JPEG", exif=exif), pose="true")
+    pose = service.json("GET", f"/jobs/{job_id}/result")["pose"]
+    assert pose["camera"]["source"] == "exif"
+    assert pose["camera"]["focal_pixels"] == pytest.approx(CAMERA.focal_pixels, rel=0.02)
+    path = f"/similarity/{ids[2]}"
+    stored = service.json("POST", path, params={"pose": "true"})["pose"]
+    assert stored["camera"]["source"] == "map"
+    assert np.linalg.norm(stored["position"] - scene.component.centres()[2]) < 0.05
+    with service.catalog.write() as session:
+        session.get_one(Photo, UUID(ids[2])).focal_length = CAMERA.focal_length
+    stored = service.json("POST", path, params={"pose": "true"})["pose"]
+    assert stored["camera"]["source"] == "exif"
+
+
+@pytest.mark.parametrize(
+    ("columns", "reason"),
+    [
+        ({"alignment": None, "not_aligned": NOT_ALIGNED}, NOT_ALIGNED),
+        ({"calibration": None}, "could not be measured"),
+    ],
+    ids=["not aligned", "not calibrated"],
+)
+def test_component_without_coordinates_gives_a_pose_in_its_frame_and_the_reason(
+    service: Service,
+    scene: ReconstructedScene,
+    ids: list[str],
+    columns: dict[str, Any],
+    reason: str,
+) -> None:
+    reconstruct(service, scene, ids, **columns)
+    pose = ask(service, take_query(scene))["pose"]
+    assert reason in pose["reason"]
+    assert {pose[name] for name in ("latitude", "longitude", "radius_68_m", "heading")} == {None}
+    assert np.linalg.norm(np.array(pose["position"]) - CENTRE) < 0.2
+    headers = {"Accept": MEDIA_TYPE}
+    answer = service("POST", f"/similarity/{ids[0]}", headers=headers)
+    assert reason in problem(answer, 422, "no_pose")["detail"]
+
+
+@pytest.mark.parametrize(
+    ("case", "reason"),
+    [
+        ("no reconstruction", "no reconstruction yet"),
+        ("features of another model", "is of local features of xfeat@0123456789ab"),
+        ("matching off", "`matching` is off"),
+        ("other place", "no matches with points"),
+        ("no texture", "too little texture"),
+        ("search fails", "No search worker answers."),
+        ("filtered", "most similar photos belongs to the reconstruction"),
+    ],
+)
+def test_query_without_a_pose_is_answered_with_the_reason(
+    service: Service,
+    scene: ReconstructedScene,
+    ids: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    case: str,
+    reason: str,
+) -> None:
+    features, params = take_query(scene), {}
+    if case != "no reconstruction":
+        reconstruct(service, scene, ids)
+    if case == "features of another model":
+        with service.catalog.write() as session:
+            session.query(Chunk).update({"features_model": "aliked-n16@0123456789ab"})
+    elif case == "matching off":
+        with service.catalog.write() as session:
+            session.query(Map).one().matching = Matching.OFF
+    elif case == "other place":
+        features = scene_features(1)
+    elif case == "no texture":
+        features = LocalFeatures.empty((1280, 960), 64)
+    elif case == "search fails":
+
+        def fail(_: object) -> None:
+            raise Unavailable("search_unavailable", "No search worker answers.")
+
+        monkeypatch.setattr(service.search, "estimate_pose", fail)
+    elif case == "filtered":
+        params = {"ids": ids[-1]}
+    answer = ask(service, features, **params)
+    assert answer["pose"] is None
+    assert reason in answer["no_pose"]
+    assert len(answer["similar_images"]) == (1 if params else len(ids))
+
+
+def test_geopose_is_an_answer_of_each_way_to_ask(
+    service: Service, scene: ReconstructedScene, ids: list[str]
+) -> None:
+    reconstruct(service, scene, ids)
+    accept = {"Accept": f"{MEDIA_TYPE}; version=1.0, */*;q=0.1"}
+    place = ORIGIN.to_geographic(SIMILARITY.apply(CENTRE))
+    job_id = described(service, take_query(scene), pose="true", geopose="ypr")
+    answer = service("GET", f"/jobs/{job_id}/result", headers=accept)
+    assert answer.headers["Content-Type"] == MEDIA_TYPE
+    assert answer.json()["position"] == pytest.approx(
+        {"lat": place.latitude, "lon": place.longitude, "h": place.altitude_m}, abs=0.1
+    )
+    angles = {"yaw": 90 - HEADING + TURN_DEGREES, "pitch": 0, "roll": 0}
+    assert answer.json()["angles"] == pytest.approx(angles, abs=1)
+    stored = service.json("POST", f"/similarity/{ids[1]}", headers=accept)
+    assert stored.keys() == {"position", "quaternion"}
+    unposed = described(service, take_query(scene), pose="false")
+    answer = service("GET", f"/jobs/{unposed}/result", headers=accept)
+    assert "pose=true" in problem(answer, 422, "no_pose")["detail"]
+    preferred = {"Accept": f"application/json, {MEDIA_TYPE};q=0.5"}
+    plain = service.json("POST", f"/similarity/{ids[1]}", headers=preferred)
+    assert "similar_images" in plain
+
+
+def test_a_query_that_accepts_geopose_gets_local_features(
+    service: Service, scene: ReconstructedScene, ids: list[str]
+) -> None:
+    accepting: list[dict[str, str]] = [{}, {"Accept": MEDIA_TYPE}]
+    for headers in accepting:
+        started = service.json(
+            "POST",
+            "/similarity",
+            202,
+            files={"file": ("query.jpg", photo_bytes(0))},
+            headers=headers,
+        )
+        service.drain()
+        expected = contextlib.nullcontext() if headers else pytest.raises(NotFound)
+        with expected:
+            service.store.get(query_features_key(UUID(started["job_id"])))
+
+
+def test_geopose_turns_as_the_rotation_of_the_camera_does() -> None:
+    blank: dict[str, Any] = dict.fromkeys(CameraPoseResponse.model_fields)
+    for seed in range(20):
+        rotation = rotation_of_vector(np.random.default_rng(seed).normal(0, 1.5, 3))
+        attitude = attitude_of(rotation)
+        pose = CameraPoseResponse.model_construct(
+            **blank
+            | {"latitude": 1.0, "longitude": 2.0, "altitude_m": 3.0}
+            | {"heading": attitude.heading, "pitch": attitude.pitch, "roll": attitude.roll}
+        )
+        angles = geopose(pose, GeoPoseForm.YPR)["angles"]
+        assert tuple(angles.values()) == pytest.approx(geopose_angles(rotation), abs=1e-6)
+        x, y, z, w = geopose(pose, GeoPoseForm.QUATERNION)["quaternion"].values()
+        quaternion = np.array([w, x, y, z])
+        expected = quaternion_of(geopose_rotation(rotation))
+        assert abs(quaternion @ expected) == pytest.approx(1)
+
+
+def test_pose_without_a_height_is_no_geopose(
+    service: Service, scene: ReconstructedScene, ids: list[str]
+) -> None:
+    unknown = ALIGNMENT | {"similarity": replace(SIMILARITY, knows_altitude=False).as_json()}
+    reconstruct(service, scene, ids, alignment=unknown)
+    path = f"/similarity/{ids[0]}"
+    assert service.json("POST", path, params={"pose": "true"})["pose"]["altitude_m"] is None
+    answer = service("POST", path, headers={"Accept": MEDIA_TYPE})
+    assert "no height" in problem(answer, 422, "no_pose")["detail"]
