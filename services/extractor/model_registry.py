@@ -25,6 +25,7 @@ from shared.descriptors.backbones import Backbone
 from shared.descriptors.extractor import Extractor, choose_device, spec_fingerprint
 from shared.descriptors.inference import PRECISIONS, BatchSizeLimit, Precision, choose_precision
 from shared.descriptors.pca_whitening import PcaProjection, decode_whitening
+from shared.descriptors.side_by_side import SideBySideExtractor
 from shared.descriptors.vocabulary import ClusterCentres, decode_centres
 from shared.errors import PlacewiseError, Unavailable
 from shared.extractor_config.configs import ExtractorConfig
@@ -141,6 +142,9 @@ class ModelRegistry:
         return self.extractor(generation.extractor, precision)
 
     def _load(self, config: ExtractorConfig, precision: Precision) -> Extractor:
+        if config.parts:
+            parts = [self.extractor(part.name, precision) for part in config.parts]
+            return SideBySideExtractor(config, parts)
         limit = self._pass_limits[config.backbone_key]
         shared_backbone = self._backbones.get(config.backbone_key)
         if shared_backbone is not None:
@@ -223,9 +227,14 @@ class ModelRegistry:
 def _ensure_model_row(session: Session, extractor: Extractor) -> Model:
     """Return the catalog's row of the extractor's weights, creating it if needed.
 
+    Of two extractors side by side, it is that of the first.
+
     Raises:
         Misconfigured: `model_missing` if an added model has been removed meanwhile.
     """
+    if isinstance(extractor, SideBySideExtractor):
+        models = [_ensure_model_row(session, part) for part in extractor.parts]
+        return models[0]
     backbone = extractor.backbone
     for added in extractor.config.added_models:
         # Locked, because a generation that uses it is created in this transaction.

@@ -108,6 +108,8 @@ def word_weights_unavailable_reason(session: Session, generation: Generation) ->
     preprocessing = generation.spec["preprocessing"]["name"]
     if preprocessing in ANYLOC_PREPROCESSING_NAMES:
         return f"with {preprocessing} its ranking has to be that of its authors' code"
+    if "beside" in generation.spec:
+        return "its rows are those of two extractors side by side"
     vocabulary = session.get_one(Vocabulary, generation.vocabulary_id)
     if "pca" in generation.spec or (
         vocabulary.clusters * vocabulary.dimension != generation.dimension

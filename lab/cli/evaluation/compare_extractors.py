@@ -43,7 +43,7 @@ from shared.descriptors.inference import inference_clock
 from shared.descriptors.pca_fit import check_pca_fittable, fit_pca_stream, sample_rows, sample_size
 from shared.descriptors.pca_whitening import PcaProjection
 from shared.errors import InvalidRequest
-from shared.extractor_config.configs import MAX_PCA_DIMENSION, get_extractor_config
+from shared.extractor_config.configs import MAX_PCA_DIMENSION, SIDE_BY_SIDE, get_extractor_config
 
 BLOCK_BYTES = 64_000_000
 SEED = 0
@@ -106,7 +106,8 @@ def parse_entries(text: str) -> list[ComparisonEntry]:
     parts: list[str] = []
     for part in text.split(","):
         # A comma also separates the options of one extractor.
-        if parts and "=" in part.partition("+")[0] and ":" in parts[-1] and ":" not in part:
+        first = part.partition("+")[0]
+        if parts and "=" in first and ":" in parts[-1] and ":" not in first:
             parts[-1] += "," + part
         else:
             parts.append(part.strip())
@@ -114,9 +115,10 @@ def parse_entries(text: str) -> list[ComparisonEntry]:
 
 
 def _parse_entry(spec_text: str) -> ComparisonEntry:
-    name, *additions = spec_text.split("+")
-    fit, pca = False, None
-    for addition in additions:
+    name, fit, pca = spec_text, False, None
+    # What follows another plus sign is an extractor that stands beside the first.
+    while (found := name.rpartition("+"))[1] and not SIDE_BY_SIDE.match("+" + found[2]):
+        name, _, addition = found
         match = PCA_SUFFIX.fullmatch(addition)
         if addition == "fit":
             fit = True

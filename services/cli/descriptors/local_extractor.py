@@ -31,6 +31,7 @@ from shared.descriptors.backbones import Backbone
 from shared.descriptors.extractor import Extractor, choose_device, not_finite_error
 from shared.descriptors.inference import PhotoTooLargeForGpu, choose_precision, inference_clock
 from shared.descriptors.pca_whitening import PcaProjection, Rows, decode_whitening
+from shared.descriptors.side_by_side import SideBySideExtractor
 from shared.descriptors.vocabulary import ClusterCentres
 from shared.descriptors.vocabulary_file import (
     VocabularyFile,
@@ -51,6 +52,8 @@ def load_extractor(config: ExtractorConfig, settings: Settings) -> Extractor:
     Raises:
         Misconfigured: The weights are missing or don't fit; `model_missing`.
     """
+    if config.parts:
+        return SideBySideExtractor(config, [load_extractor(p, settings) for p in config.parts])
     device = choose_device(settings.device)
     return Extractor(
         config,
