@@ -295,6 +295,8 @@ class PhotoHeader(Answer):
     camera: str | None
     latitude: float | None
     longitude: float | None
+    focal_length: float | None = None
+    """as a multiple of the photo's longer side"""
 
 
 class Proposal(Answer):
@@ -307,6 +309,8 @@ class Proposal(Answer):
     probability: float
     """that it was taken within `radius_m`"""
     radius_68_m: float | None
+    heading: float | None = None
+    """degrees clockwise from north; None unless it rests on a pose"""
     reason: str
 
 

@@ -18,6 +18,7 @@ from shared.catalog.chunks import find_descriptor_rows, find_features_model
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import Map, Matching
+from shared.catalog.reconstructions import Reconstruction, current_reconstruction
 from shared.errors import Misconfigured, NotFound
 from shared.imaging.decode import DecodedPhoto
 from shared.jobs import Job, JobKind
@@ -73,12 +74,14 @@ def prepare_features(
         matching = session.get_one(Map, batch.jobs[0].map_id).matching
         model = find_features_model(session, target.generation.id)
         source = active_generation(session, batch.jobs[0].map_id)
+        reconstruction = current_reconstruction(session, batch.jobs[0].map_id)
     is_query = batch.kind == JobKind.DESCRIBE
     uses_matches = target.generation.uses_matches
     if matching == Matching.OFF:
         return None
     if is_query:
-        missing = {job.id for job in batch.jobs if _is_matched(job, uses_matches)}
+        is_reconstructed = isinstance(reconstruction, Reconstruction)
+        missing = {job.id for job in batch.jobs if _is_matched(job, uses_matches, is_reconstructed)}
     elif matching == Matching.ON or uses_matches is not False:
         missing = {job.id for job in batch.jobs}
     else:
@@ -107,13 +110,13 @@ def prepare_features(
     return BatchFeatures(detector, missing - encoded.keys(), encoded)
 
 
-def _is_matched(job: Job, uses_matches: bool | None) -> bool:
+def _is_matched(job: Job, uses_matches: bool | None, is_reconstructed: bool) -> bool:
     """Return whether the search of a query photo will match it, or compute its pose."""
     params: dict[str, Any] = job.params.get("search_params", {})
     by_default = uses_matches or params.get("explain")
     matches = params.get("matches")
     is_matched = params.get("rerank") or (by_default if matches is None else matches)
-    return bool(is_matched or params.get("pose"))
+    return bool(is_matched or (is_reconstructed and params.get("pose")))
 
 
 def read_stored_features(

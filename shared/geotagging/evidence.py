@@ -1,7 +1,8 @@
 """What one source says about where a photo was taken, as a mixture of Gaussians on a plane.
 
 *Picture*: the place model's probabilities of its circles (`shared/evaluation/places/probability`),
-and the other photos that look similar, by the power law of `shared/tracks/evidence`.
+and the other photos that look similar, by the power law of `shared/tracks/evidence`. A pose of the
+photo, if it has one, is in place of both: only WRONG_POSE_SHARE of the density is theirs then.
 
 *Neighbours in time* and *GPX*: positions of known times before and after the photo, of the same
 camera or of a track. In between the position is interpolated. Between two known times the camera
@@ -31,6 +32,10 @@ SPACING_M = 12.0
 FIX_ACCURACY_M = 12.0
 """Standard deviation of a position in a photo or a GPX track"""
 OUTLIER_SHARE = 0.02
+WRONG_POSE_SHARE = 0.02
+"""Of poses, at most: 1 % of the accepted ones are wrong, and a radius may be too small"""
+RAYLEIGH_68 = 1.51
+"""Radius with 68 % of a Gaussian in the plane, in standard deviations"""
 MAX_SIGMA_M = 1000.0
 """Known times from which the camera may have moved farther say nothing"""
 
@@ -56,6 +61,17 @@ class ProbableCircle:
 
 
 @dataclass(frozen=True, slots=True)
+class PosePosition:
+    """Pose of a photo in the reconstruction of a map."""
+
+    latitude: float
+    longitude: float
+    radius_68_m: float
+    heading: float
+    """degrees clockwise from north"""
+
+
+@dataclass(frozen=True, slots=True)
 class PictureEvidence:
     """What a search of the map says about a photo."""
 
@@ -67,6 +83,7 @@ class PictureEvidence:
     """probability that the map has no photo of the place"""
     photo_count: int
     """number of photos of the map"""
+    pose: PosePosition | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +125,19 @@ class InterpolatedPosition:
 
 
 def picture_mixture(evidence: PictureEvidence, plane: Plane) -> Mixture:
-    """Return the density of the position according to the picture.
+    """Return the density of the position according to the picture."""
+    pose, similar = evidence.pose, _similarity_mixture(evidence, plane)
+    if pose is None:
+        return similar
+    others = zip(similar.means.tolist(), similar.sigmas.tolist(), similar.weights, strict=True)
+    at = plane.to_metres(pose.latitude, pose.longitude)
+    components = [(at, pose.radius_68_m / RAYLEIGH_68, 1 - WRONG_POSE_SHARE)]
+    components += [(mean, sigma, WRONG_POSE_SHARE * weight) for mean, sigma, weight in others]
+    return Mixture.of(components, WRONG_POSE_SHARE * similar.uniform)
+
+
+def _similarity_mixture(evidence: PictureEvidence, plane: Plane) -> Mixture:
+    """Return the density of the position according to similar photos and the estimate.
 
     The probability that lies between two circles goes to the similar photos there, and what these
     do not explain to a Gaussian that has most of its weight within the outer circle. The photos

@@ -6,6 +6,7 @@ themselves do not count: photos of one burst look alike, so that their pictures 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -19,6 +20,8 @@ from shared.geotagging.evidence import (
 )
 from shared.geotagging.mixture import REGION_RADIUS_M, Mixture, Plane
 
+POSE_RADII = 3.0
+"""A proposal that rests on a pose has the middle of so many of its radii of 68 % as position"""
 CONTRADICTION = 0.5
 """Probability of a source for elsewhere from which it is named as contradicting"""
 
@@ -34,6 +37,8 @@ class Proposal:
     """that the photo was taken within `radius_m` of the position"""
     radius_68_m: float
     reason: str
+    heading: float | None = None
+    """degrees clockwise from north; None without a pose"""
 
 
 def propose_position(
@@ -63,12 +68,20 @@ def propose_position(
     if not len(product.weights):
         return None
     centre, probability = product.best_circle(radius_m)
+    pose = picture.pose if picture else None
+    if pose and math.dist(plane.to_metres(pose.latitude, pose.longitude), centre) > radius_m:
+        pose = None  # contradicted by the other sources
+    if pose:
+        centre, _ = product.best_circle(min(radius_m, POSE_RADII * pose.radius_68_m))
+        probability = product.probability_within(centre, radius_m)
     latitude, longitude = plane.to_degrees(*centre)
     reasons = []
     for mixture, supports, contradicts in sources:
         within = mixture.probability_within(centre, radius_m)
         if within > (radius_m / REGION_RADIUS_M) ** 2:
-            reasons.append(supports or _looks_like(picture, latitude, longitude, radius_m))
+            found = f"pose to {pose.radius_68_m:.1f} m" if pose else None
+            similar = found or _looks_like(picture, latitude, longitude, radius_m)
+            reasons.append(supports or similar)
         elif 1 - mixture.uniform - within > CONTRADICTION:
             reasons.append(contradicts)
     return Proposal(
@@ -78,6 +91,7 @@ def propose_position(
         probability,
         product.radius_m(centre, 0.68),
         "; ".join(reasons),
+        round(pose.heading, 2) if pose else None,
     )
 
 

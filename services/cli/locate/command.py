@@ -14,7 +14,7 @@ import typer
 from rich.markup import escape
 from rich.table import Column
 
-from placewise.answers import Similar
+from placewise.answers import CameraPose, Similar
 from placewise.client import Client
 from services.cli.client import connect
 from services.cli.environment import read_settings
@@ -51,6 +51,7 @@ from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
 from shared.geotagging.evidence import (
     KnownPosition,
     PictureEvidence,
+    PosePosition,
     ProbableCircle,
     SimilarPosition,
     TimeNeighbours,
@@ -209,7 +210,7 @@ def _search_photos(
 
 def _search_photo(client: Client, photo_count: int, photo: FolderPhoto) -> SearchedPhoto:
     try:
-        answer = client.similar(photo.path, top_k=SIMILAR_PHOTOS, history=False)
+        answer = client.similar(photo.path, top_k=SIMILAR_PHOTOS, pose=True, history=False)
         if answer.matches_without_place:  # they hide photos with coordinates
             located = client.similar(
                 photo.path, top_k=SIMILAR_PHOTOS, box=WITH_COORDINATES, history=False
@@ -276,7 +277,17 @@ def picture_evidence(answer: Similar, photo_count: int) -> PictureEvidence:
         ],
         OUT_OF_MAP_SHARE if missing is None else missing,
         photo_count,
+        _pose_position(answer.pose),
     )
+
+
+def _pose_position(pose: CameraPose | None) -> PosePosition | None:
+    """Return the pose, if it has coordinates."""
+    if pose is None or pose.latitude is None or pose.longitude is None:
+        return None
+    if pose.radius_68_m is None or pose.heading is None:
+        return None
+    return PosePosition(pose.latitude, pose.longitude, pose.radius_68_m, pose.heading)
 
 
 def _print_changes(preview: Preview, accepted: Sequence[LocatedPhoto]) -> None:

@@ -23,6 +23,7 @@ from shared.imaging.file_structure import read_structure
 EXIF = "http://ns.adobe.com/exif/1.0/"
 RDF = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"
 METHOD = "estimated by Placewise"
+TRUE_NORTH = "T"  # GPSImgDirectionRef: not the magnetic one
 EMPTY_SIDECAR = f"""<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/">
  <rdf:RDF xmlns:rdf="{RDF}">
@@ -64,7 +65,11 @@ def read_position(xmp: bytes) -> tuple[float, float] | None:
 
 
 def add_position(
-    existing: bytes | None, latitude: float, longitude: float, radius_68_m: float
+    existing: bytes | None,
+    latitude: float,
+    longitude: float,
+    radius_68_m: float,
+    heading: float | None = None,
 ) -> bytes:
     """Return a sidecar with coordinates.
 
@@ -72,6 +77,7 @@ def add_position(
         existing: The sidecar so far; None for a new one.
         latitude, longitude: Degrees.
         radius_68_m: Radius that contains the position with a probability of 68 %.
+        heading: Degrees clockwise from north; a sidecar that has one keeps it.
 
     Raises:
         Unprocessable: `bad_sidecar` if it can't be edited, `has_coordinates` if it has some.
@@ -89,9 +95,14 @@ def add_position(
         "GPSLatitude": _format_degrees(latitude, "NS"),
         "GPSLongitude": _format_degrees(longitude, "EW"),
         "GPSMapDatum": "WGS-84",
-        "GPSHPositioningError": f"{radius_68_m:.0f}/1",
+        "GPSHPositioningError": hundredths(radius_68_m),
         "GPSProcessingMethod": METHOD,
     }
+    if heading is not None and "GPSImgDirection" not in there:
+        properties |= {
+            "GPSImgDirection": hundredths(heading),
+            "GPSImgDirectionRef": TRUE_NORTH,
+        }
     added = "".join(
         f'\n    exif:{name}="{value}"' for name, value in properties.items() if name not in there
     )
@@ -100,6 +111,11 @@ def add_position(
         f'    xmlns:rdf="{RDF}"\n    xmlns:exif="{EXIF}"{added}/>\n '
     )
     return data[:offset] + element.encode() + data[offset:]
+
+
+def hundredths(value: float) -> str:
+    """Return a length or an angle as a rational of EXIF."""
+    return f"{round(100 * value)}/100"
 
 
 def _exif_properties(xmp: bytes) -> dict[str, str]:

@@ -12,19 +12,26 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
 from xml.etree import ElementTree
 
 from services.cli.locate.folder import FolderPhoto, read_photo
-from services.cli.locate.sidecars import METHOD, add_position, find_sidecar, sidecar_path
+from services.cli.locate.sidecars import (
+    METHOD,
+    TRUE_NORTH,
+    add_position,
+    find_sidecar,
+    hundredths,
+    sidecar_path,
+)
 from services.cli.locate.undo_journal import UndoJournal, open_journal
 from services.cli.output import utf8_path
 from shared.errors import Misconfigured, PlacewiseError, Unprocessable
 from shared.geotagging.fusion import Proposal
-from shared.imaging.photo_header import read_photo_header
+from shared.imaging.photo_header import PhotoHeader, read_photo_header
 from shared.ingest.photo_metadata import escape_csv_text
 
 GPX_NAMESPACE = "http://www.topografix.com/GPX/1/1"
@@ -137,7 +144,7 @@ def _photo_writer(target: Target) -> Callable[[UndoJournal, Path, Proposal], Pat
 
     def write(journal: UndoJournal, photo: Path, proposal: Proposal) -> Path:
         staged = journal.stage(photo)
-        write_exif(exif_writer, staged, proposal.latitude, proposal.longitude, proposal.radius_68_m)
+        write_exif(exif_writer, staged, proposal)
         journal.install(photo, staged)
         return photo
 
@@ -152,6 +159,7 @@ def _write_sidecar(journal: UndoJournal, photo: Path, proposal: Proposal) -> Pat
         proposal.latitude,
         proposal.longitude,
         proposal.radius_68_m,
+        proposal.heading,
     )
     journal.install(path, journal.stage(path, content))
     return path
@@ -161,9 +169,10 @@ def _to_csv(locations: Sequence[LocatedPhoto]) -> bytes:
     """Return a table that `placewise index --csv` reads."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("filename", "latitude", "longitude", "place"))
+    writer.writerow(("filename", "latitude", "longitude", "heading", "place"))
     for each in locations:
-        position = (each.proposal.latitude, each.proposal.longitude) if each.proposal else ("", "")
+        found = each.proposal
+        position = (found.latitude, found.longitude, found.heading) if found else ("", "", "")
         texts = escape_csv_text(each.photo.name), escape_csv_text(each.place or "")
         writer.writerow((texts[0], *position, texts[1]))
     return text.getvalue().encode()
@@ -189,8 +198,7 @@ def _to_gpx(positions: Sequence[tuple[LocatedPhoto, Proposal]]) -> bytes:
 
 
 TOLERANCE_DEGREES = 1e-6
-ExifWriter = Callable[[Path, float, float, float], None]
-"""Takes the photo, latitude and longitude in degrees, and the radius of 68 % in metres"""
+ExifWriter = Callable[[Path, Proposal], None]
 
 
 def find_exif_writer() -> ExifWriter:
@@ -201,7 +209,7 @@ def find_exif_writer() -> ExifWriter:
     """
     program = shutil.which("exiftool")
     if program:
-        return lambda *position: _write_with_exiftool(program, *position)
+        return lambda photo, proposal: _write_with_exiftool(program, photo, proposal)
     if find_spec("pyexiv2"):
         return _write_with_pyexiv2
     raise Misconfigured(
@@ -212,39 +220,46 @@ def find_exif_writer() -> ExifWriter:
     )
 
 
-def write_exif(
-    writer: ExifWriter, photo: Path, latitude: float, longitude: float, radius_68_m: float
-) -> None:
-    """Write coordinates into a photo and read them back.
+def write_exif(writer: ExifWriter, photo: Path, proposal: Proposal) -> None:
+    """Write coordinates, and a heading unless it has one, into a photo and read them back.
 
     Raises:
         Unprocessable: `exif_not_written`.
     """
-    writer(photo, latitude, longitude, radius_68_m)
-    try:
-        with photo.open("rb") as file:
-            header = read_photo_header(file, sys.maxsize)
-    except PlacewiseError as error:
-        raise Unprocessable("exif_not_written", error.detail) from error
-    for written, read in ((latitude, header.latitude), (longitude, header.longitude)):
+    if _read_header(photo).heading is not None:
+        proposal = replace(proposal, heading=None)
+    writer(photo, proposal)
+    header = _read_header(photo)
+    for written, read in (
+        (proposal.latitude, header.latitude),
+        (proposal.longitude, header.longitude),
+    ):
         if read is None or abs(written - read) > TOLERANCE_DEGREES:
             raise Unprocessable(
                 "exif_not_written", "The coordinates can't be read back from the EXIF."
             )
 
 
-def _write_with_exiftool(
-    program: str, photo: Path, latitude: float, longitude: float, radius_68_m: float
-) -> None:
+def _read_header(photo: Path) -> PhotoHeader:
+    try:
+        with photo.open("rb") as file:
+            return read_photo_header(file, sys.maxsize)
+    except PlacewiseError as error:
+        raise Unprocessable("exif_not_written", error.detail) from error
+
+
+def _write_with_exiftool(program: str, photo: Path, proposal: Proposal) -> None:
     arguments = [
-        f"-GPSLatitude={abs(latitude):.7f}",
-        f"-GPSLatitudeRef={'NS'[latitude < 0]}",
-        f"-GPSLongitude={abs(longitude):.7f}",
-        f"-GPSLongitudeRef={'EW'[longitude < 0]}",
+        f"-GPSLatitude={abs(proposal.latitude):.7f}",
+        f"-GPSLatitudeRef={'NS'[proposal.latitude < 0]}",
+        f"-GPSLongitude={abs(proposal.longitude):.7f}",
+        f"-GPSLongitudeRef={'EW'[proposal.longitude < 0]}",
         "-GPSMapDatum=WGS-84",
-        f"-GPSHPositioningError={radius_68_m:.0f}",
+        f"-GPSHPositioningError={proposal.radius_68_m:.2f}",
         f"-GPSProcessingMethod={METHOD}",
     ]
+    if proposal.heading is not None:
+        arguments += [f"-GPSImgDirection={proposal.heading:.2f}", "-GPSImgDirectionRef=T"]
     run = subprocess.run(  # noqa: S603 the program is exiftool
         [program, "-q", "-overwrite_original", *arguments, str(photo.absolute())],
         capture_output=True,
@@ -255,19 +270,24 @@ def _write_with_exiftool(
         raise Unprocessable("exif_not_written", f"exiftool can't write the EXIF: {reason}")
 
 
-def _write_with_pyexiv2(photo: Path, latitude: float, longitude: float, radius_68_m: float) -> None:
+def _write_with_pyexiv2(photo: Path, proposal: Proposal) -> None:
     import pyexiv2  # optional
 
     values = {
         "GPSVersionID": "2 3 0 0",
-        "GPSLatitude": _rationals(latitude),
-        "GPSLatitudeRef": "NS"[latitude < 0],
-        "GPSLongitude": _rationals(longitude),
-        "GPSLongitudeRef": "EW"[longitude < 0],
+        "GPSLatitude": _rationals(proposal.latitude),
+        "GPSLatitudeRef": "NS"[proposal.latitude < 0],
+        "GPSLongitude": _rationals(proposal.longitude),
+        "GPSLongitudeRef": "EW"[proposal.longitude < 0],
         "GPSMapDatum": "WGS-84",
-        "GPSHPositioningError": f"{radius_68_m:.0f}/1",
+        "GPSHPositioningError": hundredths(proposal.radius_68_m),
         "GPSProcessingMethod": f'charset="Ascii" {METHOD}',
     }
+    if proposal.heading is not None:
+        values |= {
+            "GPSImgDirection": hundredths(proposal.heading),
+            "GPSImgDirectionRef": TRUE_NORTH,
+        }
     try:
         with pyexiv2.Image(str(photo)) as image:
             image.modify_exif({f"Exif.GPSInfo.{name}": text for name, text in values.items()})

@@ -18,6 +18,7 @@ from shared.geotagging.evidence import (
     DatedPhoto,
     KnownPosition,
     PictureEvidence,
+    PosePosition,
     ProbableCircle,
     SimilarPosition,
     TimeNeighbours,
@@ -53,6 +54,7 @@ class PhotoHeaderResponse(ResponseModel):
     camera: str | None = Field(description="make, model and serial number")
     latitude: float | None
     longitude: float | None
+    focal_length: float | None = Field(description="as a multiple of the photo's longer side")
 
 
 class _Finite(RequestModel):
@@ -77,12 +79,22 @@ class CircleBody(_Finite):
     probability: Probability
 
 
+class PoseBody(_Finite):
+    """The pose that a search found, if it has coordinates."""
+
+    latitude: Latitude
+    longitude: Longitude
+    radius_68_m: float = Field(ge=0.001, le=1e6)
+    heading: float = Field(ge=0, le=360)
+
+
 class SearchBody(_Finite):
     """What a similarity search answered for the photo."""
 
     similar: list[SimilarBody] = Field(max_length=MAX_SIMILAR, description="best first")
     circles: list[CircleBody] = Field(max_length=10, description="finest first")
     not_in_map: Probability
+    pose: PoseBody | None = None
 
 
 class DatedPhotoBody(_Finite):
@@ -142,6 +154,9 @@ class ProposalResponse(ResponseModel):
     radius_m: float
     probability: float = Field(description="that it was taken within `radius_m`")
     radius_68_m: float | None
+    heading: float | None = Field(
+        None, description="degrees clockwise from north; null unless the proposal rests on a pose"
+    )
     reason: str
 
 
@@ -213,6 +228,7 @@ def propose_positions(
                 radius_m=body.radius_m,
                 probability=proposal.probability if proposal else 0.0,
                 radius_68_m=proposal.radius_68_m if proposal else None,
+                heading=proposal.heading if proposal else None,
                 reason=proposal.reason if proposal else "nothing is known about its place",
             )
         )
@@ -233,4 +249,5 @@ def _picture_evidence(search: SearchBody | None, photo_count: int) -> PictureEvi
         ],
         search.not_in_map,
         photo_count,
+        PosePosition(**search.pose.model_dump()) if search.pose else None,
     )

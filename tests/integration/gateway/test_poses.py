@@ -255,11 +255,14 @@ def test_geopose_is_an_answer_of_each_way_to_ask(
     assert "similar_images" in plain
 
 
-def test_a_query_that_accepts_geopose_gets_local_features(
+def test_a_query_that_accepts_geopose_gets_local_features_where_there_is_a_reconstruction(
     service: Service, scene: ReconstructedScene, ids: list[str]
 ) -> None:
-    accepting: list[dict[str, str]] = [{}, {"Accept": MEDIA_TYPE}]
-    for headers in accepting:
+    accept = {"Accept": MEDIA_TYPE}
+    plain: dict[str, str] = {}
+    for headers, is_reconstructed in ((accept, False), (plain, True), (accept, True)):
+        if is_reconstructed:
+            reconstruct(service, scene, ids)
         started = service.json(
             "POST",
             "/similarity",
@@ -268,8 +271,8 @@ def test_a_query_that_accepts_geopose_gets_local_features(
             headers=headers,
         )
         service.drain()
-        expected = contextlib.nullcontext() if headers else pytest.raises(NotFound)
-        with expected:
+        has_features = headers and is_reconstructed
+        with contextlib.nullcontext() if has_features else pytest.raises(NotFound):
             service.store.get(query_features_key(UUID(started["job_id"])))
 
 

@@ -40,6 +40,7 @@ def test_time_and_camera_are_read_from_the_begin_of_a_photo(service: Service) ->
     exif = Image.Exif()
     exif[Base.Model] = "Camera"
     exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = "2026:05:01 12:00:00"
+    exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = 27
     begin = photo_bytes(1, exif=exif)[:1500]
     octets = {"Content-Type": "application/octet-stream"}
     answer = service("POST", "/photo-headers", content=begin, headers=octets)
@@ -49,6 +50,7 @@ def test_time_and_camera_are_read_from_the_begin_of_a_photo(service: Service) ->
         "camera": "Camera",
         "latitude": None,
         "longitude": None,
+        "focal_length": pytest.approx(27 / 36, rel=0.2),
     }
     refused = service("POST", "/photo-headers", content=b"no photo", headers=octets)
     assert problem(refused, 422, "undecodable_photo")
@@ -75,6 +77,12 @@ def test_searches_neighbours_and_a_track_are_combined(service: Service) -> None:
     ]
     (by_track,) = propose(service, dated("b.jpg", 5), track=track)
     assert by_track["latitude"] == pytest.approx(45.001, abs=1e-5)
+    pose = {"latitude": 45.0021, "longitude": 7.0, "radius_68_m": 0.5, "heading": 338.0}
+    (posed,) = propose(service, {**unknown, "search": {**search, "pose": pose}})
+    assert posed["latitude"] == pytest.approx(45.0021, abs=1e-6)
+    assert (posed["heading"], both["heading"]) == (338, None)
+    assert posed["radius_68_m"] < 1
+    assert posed["probability"] > 0.97
     (nothing,) = propose(service, {"name": "c.jpg"}, track=track)
     assert (nothing["latitude"], nothing["probability"]) == (None, 0)
 

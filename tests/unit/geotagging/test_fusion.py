@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
@@ -12,6 +13,7 @@ from shared.geodesy import distance_m
 from shared.geotagging.evidence import (
     KnownPosition,
     PictureEvidence,
+    PosePosition,
     ProbableCircle,
     SimilarPosition,
     interpolate_position,
@@ -186,3 +188,22 @@ def test_without_an_estimate_the_similar_photos_share_the_probability() -> None:
     mixture = picture_mixture(evidence, PLANE)
     assert mixture.weights[0] > mixture.weights[1] > 0
     assert mixture.uniform > 0.1, "photos that were not found have a share, too"
+
+
+def test_a_pose_gives_the_position_and_the_heading_unless_other_sources_contradict() -> None:
+    at = PLANE.to_degrees(12.0, -9.0)
+    pose = PosePosition(*at, radius_68_m=0.5, heading=338.0)
+    posed = replace(picture((0, 0, 0.9), (400, 0, 0.8)), pose=pose)
+    proposal = proposed(posed)
+    assert metres_from(proposal, 12, -9) < 0.1
+    assert proposal.heading == 338
+    assert proposal.radius_68_m == pytest.approx(0.5, rel=0.2)
+    assert proposal.probability > 0.97 > proposed(replace(posed, pose=None)).probability
+    assert proposal.reason == "pose to 0.5 m"
+    beside = [known(-5, 20, 0, "a.jpg"), known(5, 20, 0, "b.jpg")]
+    both = proposed(posed, beside)
+    assert metres_from(both, 12, -9) < 0.2
+    assert both.reason == "pose to 0.5 m; taken 5 s after a.jpg"
+    elsewhere = proposed(posed, [known(-1, 900, 0, "a.jpg"), known(1, 902, 0)], [known(0, 901, 0)])
+    assert metres_from(elsewhere, 901, 0) < 30
+    assert elsewhere.heading is None

@@ -15,9 +15,10 @@ from unittest.mock import Mock
 from urllib.parse import parse_qs, urlsplit
 from xml.etree import ElementTree
 
+import pyexiv2
 import pytest
 from PIL import Image
-from PIL.ExifTags import IFD, Base
+from PIL.ExifTags import GPS, IFD, Base
 from typer.testing import CliRunner, Result
 
 from services.cli.locate import command, preview, undo_journal, writers
@@ -27,7 +28,7 @@ from services.cli.main import build_app
 from shared.errors import InvalidRequest
 from shared.imaging.photo_header import read_photo_header
 from shared.ingest.photo_metadata import read_csv_manifest
-from tests.support.api_responses import PHOTO, SIMILAR, STATS
+from tests.support.api_responses import PHOTO, POSE, SIMILAR, STATS
 from tests.support.fake_server import FakeServer
 from tests.support.photos import encoded, exif_with_position, photo_image
 
@@ -361,7 +362,7 @@ def test_a_table_can_be_indexed_and_waypoints_have_names_and_times(folder: Path)
     entries = read_csv_manifest(table.read_bytes(), "table")
     assert [entry.name for entry in entries] == ["day 1/2.jpg"]
     assert entries[0].fields.keys() == {"latitude", "longitude"}
-    assert table.read_text().startswith("filename,latitude,longitude,place\n")
+    assert table.read_text().startswith("filename,latitude,longitude,heading,place\n")
     assert run(folder, "--write", "gpx").exit_code == 0
     root = ElementTree.parse(folder / "placewise-locations.gpx").getroot()
     point = root[0]
@@ -430,7 +431,9 @@ def test_what_a_preview_has_shown_is_written_although_the_map_answers_differentl
     assert "1 proposals are not as they were accepted then" in written.stderr
     assert written.stderr.rstrip().endswith(": new.jpg")
     rows = (folder / "placewise-locations.csv").read_text().splitlines()[1:]
-    coordinates = {name: (latitude, longitude) for name, latitude, longitude, _ in csv.reader(rows)}
+    coordinates = {
+        name: (latitude, longitude) for name, latitude, longitude, *_ in csv.reader(rows)
+    }
     for name, each in shown.items():
         position = each["position"]
         assert coordinates.pop(name) == (str(position["latitude"]), str(position["longitude"]))
@@ -470,7 +473,42 @@ def test_a_map_with_labels_only_gives_places(folder: Path, server: FakeServer) -
     result = searched(server, folder, "--write", "gpx")
     assert (result.exit_code, "--write csv" in result.stderr) == (1, True)
     assert searched(server, folder, "--write", "csv").exit_code == 0
-    assert "4.jpg,,,tower/floor 7" in (folder / "placewise-locations.csv").read_text()
+    assert "4.jpg,,,,tower/floor 7" in (folder / "placewise-locations.csv").read_text()
+
+
+@pytest.mark.parametrize("target", ["exif", "sidecar"])
+def test_heading_and_position_of_a_pose_are_written_unless_the_photo_has_a_heading(
+    folder: Path, server: FakeServer, monkeypatch: pytest.MonkeyPatch, target: str
+) -> None:
+    monkeypatch.setattr("shutil.which", lambda name: None)  # pyexiv2
+    exif = Image.Exif()
+    exif.get_ifd(IFD.GPSInfo)[GPS.GPSImgDirection] = 10.0
+    (folder / "4.jpg").write_bytes(encoded(photo_image(1), "JPEG", exif=exif))
+    north = 30 * DEGREES_PER_M
+    posed = answer(pose={**POSE, "latitude": LATITUDE + north, "longitude": LONGITUDE})
+    will_find(server, posed, posed)
+    found = searched_proposals(server, folder)["day 1/2.jpg"]["position"]
+    assert all("pose=true" in path for _, path, _ in server.requests if "similarity" in path)
+    assert (found["heading"], "pose to 0.4 m" in found["reason"]) == (POSE["heading"], True)
+    assert found["latitude"] == pytest.approx(LATITUDE + north, abs=0.1 * DEGREES_PER_M)
+    assert found["radius_68_m"] < 1
+    assert searched(server, folder, "--write", "csv").exit_code == 0
+    table = (folder / "placewise-locations.csv").read_bytes()
+    entries = {entry.name: entry.fields for entry in read_csv_manifest(table, "table")}
+    assert float(entries["day 1/2.jpg"]["heading"]) == POSE["heading"]
+    assert searched(server, folder, "--write", target).exit_code == 0
+    if target == "sidecar":
+        sidecar = (folder / "day 1" / "2.jpg.xmp").read_text()
+        assert 'GPSImgDirection="33804/100"' in sidecar
+        return
+    headers = []
+    for path in (folder / "day 1" / "2.jpg", folder / "4.jpg"):
+        with path.open("rb") as file:
+            headers.append(read_photo_header(file, 10**9))
+        with pyexiv2.Image(str(path)) as image:
+            tags = image.read_exif()
+        assert tags["Exif.GPSInfo.GPSHPositioningError"] in ("42/100", "41/100", "43/100")
+    assert [header.heading for header in headers] == [POSE["heading"], 10]
 
 
 def test_a_place_that_is_not_probable_enough_is_not_written_with_the_position(

@@ -108,10 +108,22 @@ def test_exiv2_reads_the_sidecar_as_darktable_and_digikam_do(
     existing: bytes | None, tmp_path: Path
 ) -> None:
     path = tmp_path / "a.jpg.xmp"
-    path.write_bytes(add_position(existing, *PLACES[1], 12.4))
+    path.write_bytes(add_position(existing, *PLACES[1], 0.42, 338.04))
     with pyexiv2.Image(str(path)) as sidecar:
         values = sidecar.read_xmp()
     assert values["Xmp.exif.GPSLatitude"] == "33,51.407064S"
     assert values["Xmp.exif.GPSLongitude"] == "151,12.917802E"
-    assert values["Xmp.exif.GPSHPositioningError"] == "12/1"
+    assert values["Xmp.exif.GPSHPositioningError"] == "42/100"
+    assert values["Xmp.exif.GPSImgDirection"] == "33804/100"
+    assert values["Xmp.exif.GPSImgDirectionRef"] == "T"
     assert values.get("Xmp.xmp.Rating") == ("4" if existing else None)
+
+
+def test_a_heading_that_is_there_is_not_changed() -> None:
+    measured = b'exif:GPSImgDirection="10/1" exif:GPSImgDirectionRef="M"\n   xmp:Rating'
+    existing = DARKTABLE.replace(b"xmp:Rating", measured).replace(
+        b"    xmlns:xmp=", f'    xmlns:exif="{EXIF}"\n    xmlns:xmp='.encode()
+    )
+    edited = add_position(existing, *PLACES[0], 1.0, 338.0)
+    assert edited.count(b"GPSImgDirection=") == 1
+    assert edited.count(b"GPSImgDirectionRef=") == 1
