@@ -93,6 +93,14 @@ class Reconstruction(Journaled, Base):
         return [info.key for info in store.list(reconstruction_prefix(self.id))]
 
 
+def gives_coordinates(session: Session, map_id: UUID) -> bool:
+    """Return whether poses in the map have coordinates and radii, at least in a component."""
+    current = current_reconstruction(session, map_id)
+    return isinstance(current, Reconstruction) and any(
+        each.alignment and each.calibration for each in current.list_components()
+    )
+
+
 def current_reconstruction(session: Session, map_id: UUID) -> Reconstruction | str:
     """Return the reconstruction for queries of the map now, or why there is none, as a sentence.
 

@@ -34,6 +34,8 @@ MIN_TAIL = 10
 HITS = 200
 """Number of first photos of the map that a frame's evidence is computed from"""
 
+MAX_ACCURACY_M = 100_000
+
 FloatArray = NDArray[np.float64]
 
 
@@ -52,11 +54,11 @@ class Hit(_Frozen):
 
 
 class PositionFix(_Frozen):
-    """A position, for example of GPS."""
+    """A position, for example of GPS, or of the frame's pose."""
 
     latitude: float = Field(ge=-90, le=90)
     longitude: float = Field(ge=-180, le=180)
-    accuracy_m: float = Field(gt=0, le=100_000)
+    accuracy_m: float = Field(gt=0, le=MAX_ACCURACY_M)
     """radius that contains the true position with a probability of 68 %"""
 
 

@@ -51,6 +51,7 @@ from services.gateway.uploads.query_photo import describe_query_job, receive_que
 from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import QUERY_TTL_SECONDS
 from shared.catalog.maps import get_map
+from shared.catalog.reconstructions import gives_coordinates
 from shared.catalog.tracks import (
     MAX_SMOOTHED_FRAMES,
     RETENTION_DAYS,
@@ -341,13 +342,11 @@ def _accept_frame(
             )
             stored = add_frame(session, track, frame, form.expected_version)
             if stored is frame:
+                # A pose without coordinates says nothing to the filter.
+                posed = SearchParams(matches=0, pose=gives_coordinates(session, track.map_id))
                 session.add(
                     describe_query_job(
-                        job_id,
-                        track.map_id,
-                        received.filename,
-                        SearchParams(matches=0),
-                        header.focal_length,
+                        job_id, track.map_id, received.filename, posed, header.focal_length
                     )
                 )
             response = _frame_response(stored, map_name)

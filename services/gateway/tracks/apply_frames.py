@@ -18,10 +18,17 @@ from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 from services.gateway.dependencies import GatewayContext
-from services.gateway.similarity.execute import missing_log_odds, query_from_job, rank_live_photos
+from services.gateway.schemas import CameraPoseResponse
+from services.gateway.similarity.execute import (
+    SimilarityQuery,
+    find_pose,
+    missing_log_odds,
+    query_from_job,
+    rank_live_photos,
+)
 from services.gateway.tracks.catalog_graph import CatalogPhotoGraph
 from services.gateway.tracks.schemas import FrameForm, TrackParams, TrackStateResponse
-from services.gateway.uploads.query_photo import query_expired_error
+from services.gateway.uploads.query_photo import query_expired_error, query_job_search_params
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import Map
 from shared.catalog.tracks import (
@@ -42,9 +49,15 @@ from shared.jobs import Job, JobState
 from shared.jobs.transitions import requeue_job_as_new
 from shared.jobs.wakeups import WakeupQueue
 from shared.search_api.background import background_frames
-from shared.search_api.protocol import RowReference
+from shared.search_api.protocol import MAX_MATCHED_PHOTOS, RowReference, SearchHit
 from shared.tracks.belief import Belief
-from shared.tracks.evidence import HITS, FrameEvidence, frame_evidence
+from shared.tracks.evidence import (
+    HITS,
+    MAX_ACCURACY_M,
+    FrameEvidence,
+    PositionFix,
+    frame_evidence,
+)
 from shared.tracks.filter import MAX_PHOTOS, TrackFilter
 from shared.tracks.nearest import find_nearest
 
@@ -128,14 +141,32 @@ def _search_evidence(gateway: GatewayContext, pending: _PendingFrame) -> FrameEv
         photo_count = CatalogPhotoGraph(session, pending.track.map_id).photo_count
         background = _background(session, pending.frame, query.generation.id)
     hits = rank_live_photos(gateway, replace(query, background=background), HITS)
+    fixes = [measured.fix(), _pose_fix(gateway, job, query, hits)]
     return frame_evidence(
         pending.frame.captured_at,
         [str(hit.photo_id) for hit in hits],
         [hit.ranked_by for hit in hits],
         photo_count,
         missing=missing_log_odds(gateway, query),
-        fix=measured.fix(),
+        fix=min(filter(None, fixes), key=lambda fix: fix.accuracy_m, default=None),
         odometry=measured.odometry(),
+    )
+
+
+def _pose_fix(
+    gateway: GatewayContext, job: Job, query: SimilarityQuery, hits: Sequence[SearchHit]
+) -> PositionFix | None:
+    """Return where the frame's pose is, if it was requested and has coordinates."""
+    first = hits[:MAX_MATCHED_PHOTOS]
+    pose = find_pose(gateway, query, first, query_job_search_params(job))
+    if not isinstance(pose, CameraPoseResponse) or pose.radius_68_m is None:
+        return None
+    assert pose.latitude is not None
+    assert pose.longitude is not None
+    return PositionFix(
+        latitude=pose.latitude,
+        longitude=pose.longitude,
+        accuracy_m=min(pose.radius_68_m, MAX_ACCURACY_M),
     )
 
 

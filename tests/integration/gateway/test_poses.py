@@ -22,6 +22,7 @@ from shared.catalog.generations import Generation
 from shared.catalog.maps import Map, Matching
 from shared.catalog.photos import Photo
 from shared.catalog.reconstructions import ReconstructedComponent
+from shared.catalog.tracks import TrackFrame
 from shared.errors import NotFound, Unavailable
 from shared.geodesy import distance_m
 from shared.geometry.component import quaternion_of
@@ -303,3 +304,46 @@ def test_pose_without_a_height_is_no_geopose(
     assert service.json("POST", path, params={"pose": "true"})["pose"]["altitude_m"] is None
     answer = service("POST", path, headers={"Accept": MEDIA_TYPE})
     assert "no height" in problem(answer, 422, "no_pose")["detail"]
+
+
+def test_a_track_takes_the_pose_of_a_frame_as_a_fix_unless_a_better_one_was_measured(
+    service: Service, scene: ReconstructedScene, ids: list[str]
+) -> None:
+    path = f"/tracks/{service.json('POST', '/tracks', 201, json={})['track_id']}/frames"
+
+    def fix_of(second: int, **fields: Any) -> dict[str, Any] | None:
+        """The fix of a frame that has the features of the query."""
+        started = service.json(
+            "POST",
+            path,
+            202,
+            files={"file": ("frame.jpg", photo_bytes(second))},
+            data={"captured_at": f"2026-05-01T12:00:0{second}Z", **fields},
+        )
+        service.drain()
+        key = query_features_key(UUID(started["job_id"]))
+        with contextlib.nullcontext() if second else pytest.raises(NotFound):
+            service.store.get(key)  # features only where poses have coordinates
+        service.store.delete(key)
+        if second:
+            put_features(service.store, take_query(scene), key=key)
+        frame = service.json("GET", started["frame_url"].removeprefix("/api/v1"))
+        assert frame["status"] == "applied"
+        with service.catalog.read() as session:
+            evidence = session.get_one(TrackFrame, UUID(frame["frame_id"])).evidence
+        assert evidence is not None
+        found: dict[str, Any] | None = evidence["fix"]
+        return found
+
+    assert fix_of(0) is None
+    reconstruct(service, scene, ids)
+    place = ORIGIN.to_geographic(SIMILARITY.apply(CENTRE))
+    measured = {"latitude": 45.2, "longitude": 7.7}
+    for fields in ({}, {**measured, "accuracy_m": 15}):
+        fix = fix_of(1 + len(fields), **fields)
+        assert fix is not None
+        at = (fix["latitude"], fix["longitude"])
+        assert distance_m(place.latitude, place.longitude, *at) < 0.5
+        assert 0 < fix["accuracy_m"] < 1
+    exact = fix_of(5, **measured, accuracy_m=0.01)
+    assert exact == {**measured, "accuracy_m": 0.01}
