@@ -22,6 +22,8 @@ ECCENTRICITY_2 = FLATTENING * (2 - FLATTENING)
 MIN_PHOTOS = 3
 MIN_SPREAD = 0.02
 """Least extent of photos across their line as a share of that along it"""
+GPS_SIGMA_M = 5.0
+"""Expected standard deviation of coordinates in each direction, of a phone in a street"""
 ROLL_SIGMA = math.radians(5)
 """Of upright photos: how far their cameras are turned about the direction in which they look"""
 UNKNOWN_ALTITUDE_SIGMA_M = 10.0
@@ -33,6 +35,8 @@ MAX_SCALE_SIGMA = 0.3
 SAMPLES = 300
 ITERATIONS = 30
 INLIER_SIGMAS = 3.0
+PART = 10
+"""Successive photos of a part of a model that may be turned against the others"""
 
 FLU_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """From a camera's axes (right, down, forward) to a body's (forward, left, up)"""
@@ -122,6 +126,8 @@ class Similarity:
     drift_m: float = 0.0
     """standard deviation of what no similarity explains, because the model or the coordinates are
     bent"""
+    drift_radians: float = 0.0
+    """that of the turn about the vertical which this bending gives to a part of the model"""
     knows_altitude: bool = True
 
     def apply(self, points: Floats) -> Floats:
@@ -147,6 +153,7 @@ class Similarity:
             "covariance": self.covariance.tolist(),
             "pivot": self.pivot.tolist(),
             "drift_m": self.drift_m,
+            "drift_radians": self.drift_radians,
             "knows_altitude": self.knows_altitude,
         }
 
@@ -312,14 +319,38 @@ def _refine(
         rotation, scale = turn @ rotation, scale * factor
         if np.abs(step).max() < 1e-9:
             break
-    residuals = (targets - scale * points @ rotation.T - translation)[is_inlier]
-    alike = _likeness_of_neighbours(residuals[:, :2])
-    spread = float(np.sqrt(np.mean(residuals[:, :2] ** 2)))
-    covariance = np.linalg.inv(normal) * (1 + alike) / (1 - alike)
-    drift = spread * math.sqrt(alike)
-    pivot = (scale * points @ rotation.T + translation).mean(axis=0)
-    found = Similarity(scale, rotation, translation, covariance, pivot, drift, knows_altitude)
+    moved = scale * points @ rotation.T + translation
+    residuals = (targets - moved)[is_inlier, :2]
+    alike = _likeness_of_neighbours(residuals)
+    variance = float(np.mean(residuals**2))
+    found = Similarity(
+        scale,
+        rotation,
+        translation,
+        np.linalg.inv(normal) * (1 + alike) / (1 - alike),
+        moved.mean(axis=0),
+        math.sqrt(variance * alike),
+        _turn_of_parts(moved[is_inlier, :2], residuals, variance * (1 - alike)),
+        knows_altitude,
+    )
     return found, is_inlier
+
+
+def _turn_of_parts(positions: Floats, residuals: Floats, variance: float) -> float:
+    """Return the standard deviation of the turns that fit the residuals of PART successive photos.
+
+    `variance` is that of residuals which are not alike, and turns parts as well.
+    """
+    squares, expected = [], []
+    for start in range(0, len(positions) - PART + 1, PART):
+        part = positions[start : start + PART] - positions[start : start + PART].mean(axis=0)
+        errors = residuals[start : start + PART]
+        extent = float(np.sum(part**2))
+        if extent > 0:
+            turn = float(np.sum(part[:, 0] * errors[:, 1] - part[:, 1] * errors[:, 0])) / extent
+            squares.append(turn**2)
+            expected.append(variance / extent)
+    return math.sqrt(max(0.0, float(np.mean(squares) - np.mean(expected)))) if squares else 0.0
 
 
 def _likeness_of_neighbours(residuals: Floats) -> float:

@@ -20,9 +20,10 @@ from shared.geometry.frames import (
 )
 from shared.geometry.localise import LocalPose
 
-NORMAL_68, NORMAL_95 = 1.07, 1.96
-"""Quantiles of the length of a normal vector over its root mean square: the larger one of vectors
-of one (1.00, 1.96) and two dimensions (1.07, 1.73)"""
+NORMAL_68 = (1.0, 1.067)
+NORMAL_95 = (1.96, 1.731)
+"""Quantiles of the length of a normal vector over its root mean square: in one dimension, and in
+two of the same standard deviation"""
 NORMAL_68_OF_ANGLE = 0.994
 
 
@@ -75,13 +76,12 @@ def geo_pose(
     rotation = pose.rotation @ similarity.rotation.T @ turn
     to_enu = turn.T @ similarity.rotation
     sigma = similarity.scale * horizontal_sigma(pose.covariance, to_enu)
-    aligned = math.sqrt(float(np.trace(similarity.position_covariance(pose.position)[:2, :2])))
+    aligned_68, aligned_95 = normal_radii(similarity.position_covariance(pose.position))
     heading = heading_sigma(pose.covariance, pose.rotation, to_enu)
     jacobian = _heading_jacobian(rotation) @ turn.T
-    of_alignment = math.sqrt(float(jacobian @ similarity.covariance[:3, :3] @ jacobian))
-    degrees = math.degrees(
-        math.hypot(calibration.heading_68 * heading, NORMAL_68_OF_ANGLE * of_alignment)
-    )
+    turned = float(jacobian @ similarity.covariance[:3, :3] @ jacobian)
+    turned = NORMAL_68_OF_ANGLE * math.sqrt(turned + similarity.drift_radians**2)
+    degrees = math.degrees(math.hypot(calibration.heading_68 * heading, turned))
     return GeoPose(
         place.latitude,
         place.longitude,
@@ -89,10 +89,28 @@ def geo_pose(
         attitude_of(rotation),
         tuple(quaternion_of(geopose_rotation(rotation)).tolist()),
         geopose_angles(rotation),
-        math.hypot(calibration.position_68 * sigma, NORMAL_68 * aligned),
-        math.hypot(calibration.position_95 * sigma, NORMAL_95 * aligned),
+        math.hypot(calibration.position_68 * sigma, aligned_68),
+        math.hypot(calibration.position_95 * sigma, aligned_95),
         min(180.0, degrees),
     )
+
+
+def normal_radii(covariance: Floats) -> tuple[float, float]:
+    """Return the radii that hold 68 and 95 % of horizontal errors, in the unit of the covariance.
+
+    Between errors along a line and those of all directions, the quantiles are interpolated by the
+    ratio of the standard deviations: within 2 % of the exact ones.
+
+    Args:
+        covariance: (3, 3) in east-north-up.
+    """
+    least, greatest = np.linalg.eigvalsh(covariance[:2, :2])
+    ratio = math.sqrt(max(0.0, least) / greatest) if greatest > 0 else 1.0
+    sigma = math.sqrt(max(0.0, least + greatest))
+    radius_68, radius_95 = (
+        sigma * (line + ratio * (disc - line)) for line, disc in (NORMAL_68, NORMAL_95)
+    )
+    return radius_68, radius_95
 
 
 def horizontal_sigma(covariance: Floats, rotation: Floats | None) -> float:

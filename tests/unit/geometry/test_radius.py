@@ -10,7 +10,7 @@ import pytest
 from shared.geometry.cameras import CameraSource
 from shared.geometry.frames import EastNorthUp, Similarity, rotation_of_vector
 from shared.geometry.localise import LocalPose
-from shared.geometry.radius import PoseCalibration, geo_pose
+from shared.geometry.radius import PoseCalibration, geo_pose, normal_radii
 from tests.support.reconstructed_scene import CAMERA, looking
 
 CALIBRATION = PoseCalibration(
@@ -64,14 +64,22 @@ def test_error_of_the_alignment_is_in_every_radius_and_grows_with_the_distance()
         for north in (0.0, 500.0)
     ]
     local = 4 * 2.0 * 0.1 * 2**0.5
-    assert radii[0] == pytest.approx(np.hypot(local, 1.96 * shift * 2**0.5), rel=1e-3)
-    expected = 1.96 * np.hypot(shift * 2**0.5, turn * 1000)
-    assert radii[1] == pytest.approx(np.hypot(local, expected), rel=1e-3)
+    assert radii[0] == pytest.approx(np.hypot(local, 2.448 * shift), rel=1e-3)
+    expected = 1.96 * np.hypot(shift, turn * 1000)  # nearly all of it is east or west
+    assert radii[1] == pytest.approx(np.hypot(local, expected), rel=0.02)
     exact = geo_pose(pose_at((0.0, 0.0, 1.0)), HERE, EXACT, CALIBRATION)
     found = geo_pose(pose_at((0.0, 0.0, 1.0)), HERE, off, CALIBRATION)
     assert found.heading_68_degrees > exact.heading_68_degrees + 0.5
     drifting = replace(EXACT, drift_m=5.0)
     assert geo_pose(pose_at((0.0, 0.0, 1.0)), HERE, drifting, CALIBRATION).radius_95_m > 9
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.2, 0.5, 0.8, 1.0])
+def test_radii_of_normal_errors_hold_their_share(ratio: float) -> None:
+    errors = np.random.default_rng(0).normal(size=(100_000, 2)) * (3.0, 3.0 * ratio)
+    lengths = np.linalg.norm(errors, axis=1)
+    radii = normal_radii(np.diag([9.0, 9 * ratio**2, 1.0]))
+    assert [np.mean(lengths < radius) for radius in radii] == pytest.approx([0.68, 0.95], abs=0.01)
 
 
 def test_heading_is_relative_to_north_at_the_position_itself() -> None:

@@ -1,0 +1,442 @@
+"""Reconstructs the photos of a map with pycolmap, in a child process.
+
+The model is computed at the working size of keypoints, so that thresholds in pixels are the same
+for photos of any size, and stored at the photos' sizes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.extractor.child_process import run_in_child
+from services.extractor.geometry.matching import VerifiedMatches
+from shared.errors import Misconfigured, Unprocessable
+from shared.geometry.cameras import Camera, Floats
+from shared.geometry.component import NO_POINT, Component
+from shared.matching.features import WORKING_SIDE
+from shared.matching.verification import MAX_EPIPOLAR_ERROR_PIXELS
+
+MIN_MODEL_PHOTOS = 3
+UNKNOWN_FOCAL_LENGTH = 0.9
+"""in longer sides, from which the reconstruction starts: 26 mm of film"""
+MIN_INFORMATION = 1e-6
+"""Least eigenvalue of a point's information as a share of the largest"""
+RANDOM_SEED = 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotoToMap:
+    """What the reconstruction needs of a photo."""
+
+    id: UUID
+    width: int
+    height: int
+    pixels: NDArray[np.float32]
+    """(n, 2) positions of its local features"""
+    focal_length: float | None = None
+    """as a multiple of the longer side; None if EXIF has none"""
+
+    @property
+    def camera_key(self) -> tuple[int, int, float]:
+        """Photos with the same key were taken with one camera."""
+        return self.width, self.height, round(self.focal_length or 0, 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MappedComponent:
+    """A component, and the folder with its COLMAP model, whose image names are photo ids."""
+
+    component: Component
+    mean_reprojection_error_pixels: float
+    """at the working size"""
+    folder: Path
+
+
+def map_photos(
+    photos: Sequence[PhotoToMap],
+    matches: VerifiedMatches,
+    folder: Path,
+    on_progress: Callable[[int], None],
+    check: Callable[[], None],
+    existing: Sequence[Path] = (),
+) -> list[MappedComponent]:
+    """Reconstruct photos as far as their matches connect them, the largest component first.
+
+    Args:
+        photos: All photos of `matches`, in any order.
+        folder: Empty; gets a folder with the COLMAP model of each component: `0`, `1`, ...
+        on_progress: Called with the number of photos that were tried.
+        check: See `run_in_child`.
+        existing: Folders of COLMAP models of some of the photos, as this function writes them: the
+            other photos are registered into these first.
+
+    Raises:
+        Unprocessable: `empty_model` if no photos can be reconstructed together.
+        Misconfigured: `pose_missing` without the extra `pose`.
+        ChildKilled: See `run_in_child`.
+    """
+    require_pycolmap()
+    return _in_child(_map, photos, matches, folder, list(existing), on_progress, check)
+
+
+def import_model(
+    photos: Sequence[PhotoToMap],
+    names: Mapping[str, UUID],
+    matches: VerifiedMatches,
+    folder: Path,
+    model: Path,
+    check: Callable[[], None],
+) -> list[MappedComponent]:
+    """Serve an existing COLMAP or hloc model: triangulate our keypoints from its camera poses.
+
+    Images whose camera has another shape than the photo, for example because the photo is stored
+    turned, are left out.
+
+    Args:
+        photos: The photos of the model.
+        names: The photo of each image name of the model; other images are left out.
+        folder: See `map_photos`.
+        model: Folder with cameras, images and points3D, as `.bin` or `.txt`.
+
+    Raises:
+        Unprocessable: `unreadable_model` if pycolmap can't read it, `empty_model` if no image of it
+            is one of the photos, or no matches agree with its poses.
+        Misconfigured, ChildKilled: See `map_photos`.
+    """
+    require_pycolmap()
+    return _in_child(
+        _triangulate, photos, matches, folder, (model, dict(names)), lambda _: None, check
+    )
+
+
+def require_pycolmap() -> Any:
+    """Return pycolmap, which is quiet; Misconfigured (`pose_missing`) without it."""
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise Misconfigured(
+            "pose_missing",
+            "Reconstruction needs the package pycolmap, which is not installed. In the repository: "
+            "uv pip install '.[pose]'.",
+        ) from error
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
+    return pycolmap
+
+
+def _in_child(
+    function: Callable[..., list[float]],
+    photos: Sequence[PhotoToMap],
+    matches: VerifiedMatches,
+    folder: Path,
+    models: Any,
+    on_progress: Callable[[int], None],
+    check: Callable[[], None],
+) -> list[MappedComponent]:
+    errors = run_in_child(
+        function, list(photos), matches, folder, models, on_progress=on_progress, check=check
+    )
+    return [
+        MappedComponent(
+            Component.decode((folder / f"{number}.npz").read_bytes()), error, folder / str(number)
+        )
+        for number, error in enumerate(errors)
+    ]
+
+
+def _map(
+    photos: list[PhotoToMap],
+    matches: VerifiedMatches,
+    folder: Path,
+    existing: list[Path],
+    report: Callable[[int], None],
+) -> list[float]:
+    """Write all components into the folder and return their errors; runs in the child."""
+    pycolmap = require_pycolmap()
+    with TemporaryDirectory(prefix="placewise-map-") as scratch:
+        models = []
+        for path in existing:
+            model = pycolmap.Reconstruction(str(path))
+            scales = {number: _working_scale(camera) for number, camera in model.cameras.items()}
+            models.append(_resized(model, scales))
+        database = Path(scratch) / "database.db"
+        _write_database(pycolmap, photos, matches, database, models)
+        tried = 0
+
+        def count() -> None:
+            nonlocal tried
+            tried += 1
+            report(tried)
+
+        def run(name: str, start: Path | str, names: list[str]) -> list[Any]:
+            options = pycolmap.IncrementalPipelineOptions()
+            options.min_model_size = MIN_MODEL_PHOTOS
+            options.extract_colors = False
+            options.random_seed = RANDOM_SEED
+            options.image_names = names
+            out = Path(scratch) / name
+            out.mkdir()
+            found = pycolmap.incremental_mapping(
+                str(database), scratch, str(out), options, str(start), next_image_callback=count
+            )
+            return list(found.values())
+
+        rest = {str(photo.id) for photo in photos} - {name for m in models for name in _names(m)}
+        found: list[Any] = []
+        for number, model in enumerate(models):
+            start = Path(scratch) / f"start-{number}"
+            start.mkdir()
+            model.write(str(start))
+            found += run(f"extended-{number}", start, sorted(rest | set(_names(model))))[:1]
+            rest -= set(_names(found[-1]))
+        if len(rest) >= MIN_MODEL_PHOTOS:
+            found += run("anew", "", sorted(rest))
+        return _write_models(photos, found, folder)
+
+
+def _triangulate(
+    photos: list[PhotoToMap],
+    matches: VerifiedMatches,
+    folder: Path,
+    source: tuple[Path, dict[str, UUID]],
+    _report: Callable[[int], None],
+) -> list[float]:
+    """Write the imported component into the folder and return its error; runs in the child."""
+    pycolmap = require_pycolmap()
+    path, names = source
+    try:
+        imported = pycolmap.Reconstruction(str(path))
+    except Exception as error:  # pycolmap raises what its file readers raise
+        raise Unprocessable(
+            "unreadable_model", f"{path.name} is no COLMAP model: {error}"
+        ) from error
+    of_id = {photo.id: photo for photo in photos}
+    model = pycolmap.Reconstruction()
+    for number in sorted(imported.reg_image_ids()):
+        image = imported.image(number)
+        photo, camera = of_id.get(names.get(image.name, UUID(int=0))), image.camera
+        if photo is None or not _has_shape(photo, camera):
+            continue
+        if not model.exists_camera(image.camera_id):
+            scaled = pycolmap.Camera(camera.todict())
+            _resize(scaled, _working_scale(camera))
+            model.add_camera_with_trivial_rig(scaled)
+        ours = pycolmap.Image(
+            name=str(photo.id),
+            keypoints=_working_pixels(photo).astype(float),
+            camera_id=image.camera_id,
+            image_id=number,
+        )
+        model.add_image_with_trivial_frame(ours, image.cam_from_world())
+    if not model.num_reg_images():
+        raise Unprocessable(
+            "empty_model", "No image of the model has the name of a photo of the map."
+        )
+    with TemporaryDirectory(prefix="placewise-map-") as scratch:
+        database = Path(scratch) / "database.db"
+        _write_database(pycolmap, photos, matches, database, [model])
+        found = pycolmap.triangulate_points(model, str(database), scratch, scratch)
+        return _write_models(photos, [found], folder)
+
+
+def _has_shape(photo: PhotoToMap, camera: Any) -> bool:
+    return bool(abs(camera.width / camera.height * photo.height / photo.width - 1) < 0.01)
+
+
+def _names(model: Any) -> list[str]:
+    return [model.image(number).name for number in model.reg_image_ids()]
+
+
+def _write_database(
+    pycolmap: Any,
+    photos: Sequence[PhotoToMap],
+    matches: VerifiedMatches,
+    path: Path,
+    models: Sequence[Any],
+) -> None:
+    """Write cameras, keypoints and verified matches; photos of models keep their numbers."""
+    by_name = {str(photo.id): photo for photo in photos}
+    image_ids: dict[str, int] = {}
+    cameras: dict[int, Any] = {}
+    camera_of: dict[str, int] = {}
+    of_key: dict[tuple[int, int, float], int] = {}
+    for model in models:
+        for number in model.reg_image_ids():
+            image = model.image(number)
+            image_ids[image.name] = number
+            cameras[image.camera_id] = image.camera
+            camera_of[image.name] = image.camera_id
+            of_key.setdefault(by_name[image.name].camera_key, image.camera_id)
+    first = max(image_ids.values(), default=0) + 1
+    new = [photo for name, photo in by_name.items() if name not in image_ids]
+    for number, photo in enumerate(new, first):
+        image_ids[str(photo.id)] = number
+        if photo.camera_key not in of_key:
+            camera_id = max(cameras, default=0) + 1
+            of_key[photo.camera_key] = camera_id
+            cameras[camera_id] = _working_camera(pycolmap, photo, camera_id)
+        camera_of[str(photo.id)] = of_key[photo.camera_key]
+    database = pycolmap.Database.open(str(path))
+    for camera_id in sorted(cameras):
+        database.write_camera(cameras[camera_id], use_camera_id=True)
+    for name, number in sorted(image_ids.items(), key=lambda item: item[1]):
+        image = pycolmap.Image(name=name, camera_id=camera_of[name], image_id=number)
+        database.write_image(image, use_image_id=True)
+        database.write_keypoints(number, _working_pixels(by_name[name]))
+    lines = []
+    for (one, other), keypoints in zip(matches.pairs.tolist(), matches.keypoints, strict=True):
+        pair = str(matches.photo_ids[one]), str(matches.photo_ids[other])
+        if pair[0] in image_ids and pair[1] in image_ids:
+            numbers = image_ids[pair[0]], image_ids[pair[1]]
+            database.write_matches(*numbers, keypoints.astype(np.uint32))
+            lines.append(" ".join(pair))
+    database.close()
+    pairs = path.with_name("pairs.txt")
+    pairs.write_text("\n".join(lines))
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.max_error = MAX_EPIPOLAR_ERROR_PIXELS * 2
+    options.ransac.random_seed = RANDOM_SEED
+    pycolmap.verify_matches(str(path), str(pairs), options)
+
+
+def _working_pixels(photo: PhotoToMap) -> NDArray[np.float32]:
+    return np.asarray(photo.pixels * (WORKING_SIDE / max(photo.width, photo.height)), np.float32)
+
+
+def _working_camera(pycolmap: Any, photo: PhotoToMap, camera_id: int) -> Any:
+    focal = (photo.focal_length or UNKNOWN_FOCAL_LENGTH) * max(photo.width, photo.height)
+    camera = pycolmap.Camera.create_from_model_name(
+        camera_id, "SIMPLE_RADIAL", focal, photo.width, photo.height
+    )
+    camera.has_prior_focal_length = photo.focal_length is not None
+    _resize(camera, _working_scale(camera))
+    return camera
+
+
+def _working_scale(camera: Any) -> float:
+    return float(WORKING_SIDE / max(camera.width, camera.height))
+
+
+def _resize(camera: Any, scale: float) -> None:
+    """Scale a camera; its sides are rounded, its principal point is not."""
+    params = np.array(camera.params)
+    focals = len(camera.focal_length_idxs())
+    params[: focals + 2] *= scale  # of all models of COLMAP, focal lengths and principal point
+    camera.width, camera.height = round(camera.width * scale), round(camera.height * scale)
+    camera.params = params
+
+
+def _resized(model: Any, scales: Mapping[int, float]) -> Any:
+    """Scale cameras and keypoints of a model in place, by camera, and return it."""
+    for number, camera in model.cameras.items():
+        _resize(camera, scales[number])
+    for image in model.images.values():
+        for point in image.points2D:
+            point.xy = point.xy * scales[image.camera_id]
+    model.update_point_3d_errors()
+    return model
+
+
+def _write_models(photos: Sequence[PhotoToMap], models: Sequence[Any], folder: Path) -> list[float]:
+    """Write models at the photos' sizes with their components, the one with most photos first."""
+    by_name = {str(photo.id): photo for photo in photos}
+    errors = []
+    ordered = sorted(models, key=lambda model: -model.num_reg_images())
+    for number, model in enumerate(m for m in ordered if m.num_points3D()):
+        errors.append(float(model.compute_mean_reprojection_error()))
+        scales = {}
+        for image in model.images.values():
+            photo = by_name[image.name]
+            scales[image.camera_id] = max(photo.width, photo.height) / WORKING_SIDE
+        component = _component_of(model, by_name, scales)
+        (folder / f"{number}.npz").write_bytes(component.encode())
+        _resized(model, scales)
+        for image in model.images.values():  # exactly, and not as the rounded sides are scaled
+            image.camera.width = by_name[image.name].width
+            image.camera.height = by_name[image.name].height
+        (folder / str(number)).mkdir()
+        model.write(str(folder / str(number)))
+    if not errors:
+        raise Unprocessable(
+            "empty_model",
+            "No photos could be reconstructed together: too few matches agree with each other.",
+        )
+    return errors
+
+
+def _component_of(
+    model: Any, photos: Mapping[str, PhotoToMap], scales: Mapping[int, float]
+) -> Component:
+    """Return the component of a model at the working size."""
+    point_ids = sorted(model.point3D_ids())
+    number_of = {point: number for number, point in enumerate(point_ids)}
+    xyz = np.array([model.point3D(point).xyz for point in point_ids]).reshape(-1, 3)
+    camera_numbers = {number: row for row, number in enumerate(sorted(model.cameras))}
+    ids, rotations, translations, numbers_of_photos, cameras = [], [], [], [], []
+    counts = np.zeros(len(point_ids), np.int32)
+    information = np.zeros((len(point_ids), 3, 3))
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.image(image_id)
+        numbers = np.full(len(image.points2D), NO_POINT, np.int32)
+        for row in image.get_observation_point2D_idxs():
+            numbers[row] = number_of[image.points2D[row].point3D_id]
+        pose = image.cam_from_world()
+        ids.append(photos[image.name].id)
+        x, y, z, w = pose.rotation.quat
+        rotations.append((w, x, y, z))
+        translations.append(pose.translation)
+        cameras.append(camera_numbers[image.camera_id])
+        numbers_of_photos.append(numbers)
+        seen = np.unique(numbers[numbers != NO_POINT])
+        counts[seen] += 1
+        information[seen] += _point_information(
+            xyz[seen], pose.rotation.matrix(), pose.translation, image.camera.mean_focal_length()
+        )
+    return Component(
+        tuple(ids),
+        np.array(rotations),
+        np.array(translations),
+        np.array(cameras, np.int32),
+        tuple(numbers_of_photos),
+        tuple(
+            _stored_camera(model.camera(number), scales[number]) for number in sorted(model.cameras)
+        ),
+        xyz,
+        _inverse(information).astype(np.float32),
+        counts,
+    )
+
+
+def _point_information(
+    points: Floats, rotation: Floats, translation: Floats, focal: float
+) -> Floats:
+    """Return (m, 3, 3) J^T J of the projections of points by their coordinates, in pixels."""
+    seen = points @ rotation.T + translation
+    jacobian = np.zeros((len(points), 2, 3))
+    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1
+    jacobian[:, :, 2] = -seen[:, :2] / seen[:, 2:]
+    jacobian = jacobian * (focal / seen[:, 2, None, None]) @ rotation
+    found: Floats = jacobian.transpose(0, 2, 1) @ jacobian
+    return found
+
+
+def _inverse(information: Floats) -> Floats:
+    """Return the inverses of (p, 3, 3), bounded where a point's distance is hardly known."""
+    values, vectors = np.linalg.eigh(information)
+    values = np.maximum(values, values[:, -1:] * MIN_INFORMATION)
+    found: Floats = vectors / values[:, None, :] @ vectors.transpose(0, 2, 1)
+    return found
+
+
+def _stored_camera(camera: Any, scale: float) -> Camera:
+    """Return a camera at its photos' size; of other models the focal length alone."""
+    radial = float(camera.params[3]) if camera.model_name == "SIMPLE_RADIAL" else 0.0
+    width, height = round(camera.width * scale), round(camera.height * scale)
+    return Camera(width, height, float(camera.mean_focal_length() * scale), radial)

@@ -1,0 +1,131 @@
+"""Errors of left-out photos, their quantiles, and proposals for wrong coordinates."""
+
+from __future__ import annotations
+
+from uuid import UUID
+
+import numpy as np
+import pytest
+
+from services.extractor.geometry.calibrate import (
+    LeftOutPose,
+    calibrate,
+    localise_left_out,
+    propose_coordinates,
+)
+from shared.geodesy import distance_m
+from shared.geometry.frames import Alignment, EastNorthUp, Similarity, align, rotation_of_vector
+from shared.matching.matchers import MutualNearest
+from tests.support.reconstructed_scene import ReconstructedScene
+
+COUNT = 10
+
+
+@pytest.fixture(scope="module")
+def scene() -> ReconstructedScene:
+    return ReconstructedScene(photos=COUNT)
+
+
+def left_out(
+    scene: ReconstructedScene, seconds: np.ndarray, similarity: Similarity | None = None
+) -> list[LeftOutPose | None]:
+    reports: list[int] = []
+    found = localise_left_out(
+        scene.component,
+        scene.features,
+        np.eye(COUNT, dtype=np.float32),
+        seconds,
+        [500 / 640 if n % 2 else None for n in range(COUNT)],
+        MutualNearest(0.9),
+        similarity,
+        reports.append,
+    )
+    assert reports == list(range(1, COUNT + 1))
+    return found
+
+
+def test_photos_are_localised_without_themselves_and_their_neighbours(
+    scene: ReconstructedScene,
+) -> None:
+    poses = left_out(scene, np.full(COUNT, np.nan))
+    assert all(pose and pose.distance < 10 * pose.distance_sigma for pose in poses)
+    calibration = calibrate(poses)
+    assert calibration.poses == COUNT
+    assert calibration.share_found == 1
+    assert 0.2 < calibration.position_68 < 5
+    # Within 2 s of each other, no other photo is left for any of them.
+    assert left_out(scene, np.linspace(0, 1.9, COUNT)) == [None] * COUNT
+
+
+def test_errors_of_an_aligned_component_are_horizontal(scene: ReconstructedScene) -> None:
+    turn = rotation_of_vector(np.array([0.0, np.pi / 2, 0.0]))  # the scene's x is down
+    aligned = Similarity(3.0, turn, np.zeros(3), np.zeros((7, 7)), np.zeros(3))
+    seconds = np.full(COUNT, np.nan)
+    everywhere, horizontal = left_out(scene, seconds), left_out(scene, seconds, aligned)
+    for whole, part in zip(everywhere, horizontal, strict=True):
+        assert whole
+        assert part
+        assert part.distance < whole.distance
+        assert part.distance_sigma < whole.distance_sigma
+
+
+def errors(*ratios: float) -> list[LeftOutPose | None]:
+    return [LeftOutPose(UUID(int=1), ratio, 1.0, 2 * ratio, 1.0) for ratio in ratios]
+
+
+def test_quantiles_are_those_of_conformal_prediction() -> None:
+    found = calibrate([*errors(*np.arange(1.0, 100.0)), None])
+    assert (found.position_68, found.position_95) == (68, 95)
+    assert (found.heading_68, found.heading_95) == (136, 190)
+    assert (found.poses, found.share_found) == (99, 0.99)
+
+
+def test_radius_contains_its_share_of_new_errors() -> None:
+    rng = np.random.default_rng(0)
+    inside = [
+        np.abs(rng.standard_t(3, 500))
+        < calibrate(errors(*np.abs(rng.standard_t(3, 60)))).position_68
+        for _ in range(200)
+    ]
+    assert np.mean(inside) == pytest.approx(0.68, abs=0.02)
+
+
+def test_few_poses_never_promise_less_than_the_largest_error() -> None:
+    found = calibrate(errors(0.5, 4.0))
+    assert (found.position_68, found.position_95) == (4.0, 4.0)
+    assert calibrate(errors(0.5)).position_95 == 1.96
+    nothing = calibrate([None])
+    assert (nothing.position_68, nothing.share_found, nothing.poses) == (1.0, 0, 0)
+
+
+def aligned_walk(scene: ReconstructedScene, wrong_m: float) -> tuple[Alignment, EastNorthUp]:
+    """Every unit of the scene is 10 m; photo 4 is `wrong_m` too far north."""
+    plane = EastNorthUp(45.0, 179.99999)
+    metres = 10 * scene.component.centres()
+    metres[4, 1] += wrong_m
+    places = [plane.to_geographic(row) for row in metres]
+    found = align(
+        scene.component.centres(),
+        [scene.component.rotation(row) for row in range(COUNT)],
+        np.array([p.latitude for p in places]),
+        np.array([p.longitude for p in places]),
+        np.array([p.altitude_m for p in places]),
+        np.full(COUNT, 3.0),
+    )
+    assert isinstance(found, Alignment), found
+    return found, plane.to_geographic(10 * scene.component.centres()[4])
+
+
+def test_coordinates_that_disagree_get_a_proposal(scene: ReconstructedScene) -> None:
+    alignment, right = aligned_walk(scene, wrong_m=50.0)
+    (proposal,) = propose_coordinates(scene.component, alignment, np.full(COUNT, 3.0))
+    assert proposal.photo == scene.component.photo_ids[4]
+    assert proposal.distance_m == pytest.approx(50, abs=1)
+    assert proposal.altitude_m == pytest.approx(right.altitude_m, abs=0.5)
+    off = distance_m(proposal.latitude, proposal.longitude, right.latitude, right.longitude)
+    assert off < max(0.1, proposal.radius_95_m)
+
+
+def test_coordinates_within_their_expected_error_are_left_alone(scene: ReconstructedScene) -> None:
+    alignment, _ = aligned_walk(scene, wrong_m=8.0)
+    assert propose_coordinates(scene.component, alignment, np.full(COUNT, 3.0)) == []

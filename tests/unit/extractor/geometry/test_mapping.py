@@ -1,0 +1,191 @@
+"""Reconstructions of a scene whose poses are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from services.extractor.geometry.mapping import (
+    MappedComponent,
+    PhotoToMap,
+    import_model,
+    map_photos,
+)
+from services.extractor.geometry.matching import VerifiedMatches, match_pairs
+from shared.errors import Unprocessable
+from shared.geometry.cameras import Camera, CameraSource
+from shared.geometry.component import NO_POINT, Component
+from shared.geometry.frames import umeyama
+from shared.geometry.localise import LocalPose, localise
+from shared.matching.matchers import MutualNearest
+from tests.support.reconstructed_scene import ReconstructedScene
+
+PHOTOS = 8
+CAMERA = Camera(1280, 960, 1000.0)
+MATCHER = MutualNearest(0.9)
+
+
+def everything(scene: ReconstructedScene) -> tuple[list[PhotoToMap], VerifiedMatches]:
+    photos = [
+        PhotoToMap(photo, f.width, f.height, f.pixels().astype(np.float32))
+        for photo, f in scene.features.items()
+    ]
+    pairs = np.array([(i, j) for j in range(len(photos)) for i in range(j)], np.int32)
+    return photos, match_pairs(scene.features, pairs, MATCHER, lambda _: None)
+
+
+def position_errors(found: Component, scene: ReconstructedScene) -> np.ndarray:
+    truth = dict(zip(scene.component.photo_ids, scene.component.centres(), strict=True))
+    centres = np.array([truth[photo] for photo in found.photo_ids])
+    scale, rotation, translation = umeyama(found.centres(), centres, np.ones(len(centres)))
+    aligned = scale * found.centres() @ rotation.T + translation
+    errors: np.ndarray = np.linalg.norm(aligned - centres, axis=1)
+    return errors
+
+
+def only(components: list[MappedComponent]) -> MappedComponent:
+    (found,) = components
+    return found
+
+
+@pytest.fixture(scope="module")
+def scene() -> ReconstructedScene:
+    return ReconstructedScene(photos=PHOTOS, camera=CAMERA)
+
+
+@pytest.fixture(scope="module")
+def mapped(scene: ReconstructedScene, tmp_path_factory: pytest.TempPathFactory) -> MappedComponent:
+    tried: list[int] = []
+    found = only(
+        map_photos(*everything(scene), tmp_path_factory.mktemp("map"), tried.append, lambda: None)
+    )
+    assert max(tried) <= PHOTOS
+    return found
+
+
+def test_reconstruction_has_the_poses_and_the_camera_of_the_photos(
+    scene: ReconstructedScene, mapped: MappedComponent
+) -> None:
+    component = mapped.component
+    assert set(component.photo_ids) == set(scene.features)
+    assert position_errors(component, scene).max() < 0.1
+    (camera,) = component.cameras
+    assert (camera.width, camera.height) == (1280, 960)
+    assert camera.focal_pixels == pytest.approx(1000, rel=0.02)
+    assert 0.1 < mapped.mean_reprojection_error_pixels < 0.6  # 0.5 in photos of twice the size
+    for photo, numbers in zip(component.photo_ids, component.point_numbers, strict=True):
+        assert len(numbers) == len(scene.features[photo].positions)
+        assert (numbers != NO_POINT).mean() > 0.5
+    counts = np.bincount(np.concatenate([n[n >= 0] for n in component.point_numbers]))
+    np.testing.assert_array_equal(counts, component.observations)
+
+
+def test_points_are_within_their_covariance(
+    scene: ReconstructedScene, mapped: MappedComponent
+) -> None:
+    component = mapped.component
+    truth_of = dict(zip(scene.component.photo_ids, scene.component.point_numbers, strict=True))
+    truth = np.full(len(component.points), -1)
+    for photo, numbers in zip(component.photo_ids, component.point_numbers, strict=True):
+        is_seen = (numbers >= 0) & (truth_of[photo] >= 0)
+        truth[numbers[is_seen]] = truth_of[photo][is_seen]
+    points, true = component.points[truth >= 0], scene.xyz[truth[truth >= 0]]
+    scale, rotation, translation = umeyama(points, true, np.ones(len(points)))
+    errors = ((true - translation) @ rotation / scale) - points
+    covariances = component.covariances[truth >= 0] * 0.25**2  # working pixels of noise
+    squares = np.einsum("pi,pij,pj->p", errors, np.linalg.inv(covariances), errors)
+    assert 1.0 < np.median(squares) < 5.0  # 2.4 of chi-squared in three dimensions
+
+
+def test_photo_is_localised_in_a_reconstruction(
+    scene: ReconstructedScene, mapped: MappedComponent
+) -> None:
+    photo, features = scene.candidates[3]
+    pose = localise(
+        features,
+        scene.candidates,
+        [mapped.component],
+        None,
+        CameraSource.ESTIMATED,
+        MATCHER,
+        frozenset({photo}),
+    )
+    assert isinstance(pose, LocalPose)
+    row = mapped.component.photo_ids.index(photo)
+    centres = mapped.component.centres()
+    unit = np.linalg.norm(centres[0] - centres[-1]) / 8  # of the scene
+    assert np.linalg.norm(pose.position - centres[row]) < 0.2 * unit
+
+
+def test_colmap_model_has_the_sizes_of_the_photos(mapped: MappedComponent) -> None:
+    model = pycolmap.Reconstruction(str(mapped.folder))
+    (camera,) = model.cameras.values()
+    assert (camera.width, camera.height) == (1280, 960)
+    assert (camera.principal_point_x, camera.principal_point_y) == (640, 480)
+    assert {i.name for i in model.images.values()} == {str(p) for p in mapped.component.photo_ids}
+    assert model.compute_mean_reprojection_error() == pytest.approx(
+        2 * mapped.mean_reprojection_error_pixels, rel=0.01
+    )
+
+
+def test_new_photos_are_registered_into_an_existing_model(
+    scene: ReconstructedScene, tmp_path: Path
+) -> None:
+    photos, matches = everything(scene)
+    for name in ("old", "new"):
+        (tmp_path / name).mkdir()
+    old = only(map_photos(photos[:5], matches, tmp_path / "old", lambda _: None, lambda: None))
+    assert len(old.component.photo_ids) == 5
+    new = only(
+        map_photos(photos, matches, tmp_path / "new", lambda _: None, lambda: None, [old.folder])
+    )
+    assert set(new.component.photo_ids) == set(scene.features)
+    assert position_errors(new.component, scene).max() < 0.1
+
+
+def test_model_of_another_tool_is_imported_with_its_poses(
+    scene: ReconstructedScene, mapped: MappedComponent, tmp_path: Path
+) -> None:
+    source, out = tmp_path / "source", tmp_path / "out"
+    source.mkdir()
+    out.mkdir()
+    model = pycolmap.Reconstruction(str(mapped.folder))
+    names = {}
+    for number, image in sorted(model.images.items()):
+        photo = next(p for p in scene.features if str(p) == image.name)
+        names[f"walk/{number:03}.jpg"] = photo
+        image.name = f"walk/{number:03}.jpg"
+    model.delete_all_points2D_and_points3D()  # its keypoints are not ours
+    model.write_text(str(source))
+    left_out = names.pop("walk/001.jpg")
+    photos, matches = everything(scene)
+    found = only(import_model(photos, names, matches, out, source, lambda: None)).component
+    assert set(found.photo_ids) == set(scene.features) - {left_out}
+    rows = [mapped.component.photo_ids.index(photo) for photo in found.photo_ids]
+    np.testing.assert_allclose(found.centres(), mapped.component.centres()[rows], atol=1e-6)
+    assert len(found.points) > 200
+    with pytest.raises(Unprocessable, match="name of a photo"):
+        import_model(photos, {}, matches, out, source, lambda: None)
+    (source / "images.txt").write_text("1 nonsense\n")
+    with pytest.raises(Unprocessable, match="no COLMAP model"):
+        import_model(photos, names, matches, out, source, lambda: None)
+
+
+def test_photos_of_different_scenes_are_components_of_their_own(
+    scene: ReconstructedScene, tmp_path: Path
+) -> None:
+    other = ReconstructedScene(photos=4, seed=2, camera=CAMERA)
+    both = ReconstructedScene(photos=1)
+    both.features = {**scene.features, **other.features}
+    found = map_photos(*everything(both), tmp_path, lambda _: None, lambda: None)
+    assert [set(c.component.photo_ids) for c in found] == [set(scene.features), set(other.features)]
+
+
+def test_photos_without_matches_are_refused(tmp_path: Path) -> None:
+    photos, _ = everything(ReconstructedScene(photos=3))
+    none = VerifiedMatches(tuple(p.id for p in photos), np.empty((0, 2), np.int32), ())
+    with pytest.raises(Unprocessable, match="too few matches"):
+        map_photos(photos, none, tmp_path, lambda _: None, lambda: None)
