@@ -19,8 +19,8 @@ export function bytes(number) {
   return `${(number / 1000 ** power).toFixed(power && number / 1000 ** power < 100 ? 1 : 0)} ${units[power]}`;
 }
 
-/** A length, short: 25 m, 2 km, 1.5 km. */
-export const metres = (length) => (length < 999.5 ? `${Math.round(length)} m` : `${Number((length / 1000).toFixed(1))} km`);
+/** A length, short: 0.4 m, 25 m, 2 km, 1.5 km. */
+export const metres = (length) => (length < 9.95 ? `${Number(length.toFixed(1))} m` : length < 999.5 ? `${Math.round(length)} m` : `${Number((length / 1000).toFixed(1))} km`);
 
 /** Degrees to the decimetre or so. */
 export const degrees = (latitude, longitude) => `${latitude.toFixed(5)}, ${longitude.toFixed(5)}`;

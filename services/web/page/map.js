@@ -8,6 +8,8 @@ const STREETS = "placewise-streets"; // the origin of the tiles that this device
 const MOST_ZOOM = 21;
 const LINES = 9; // about so many across the map
 const POINTS_DRAWN = 5000;
+const DEGREE_M = 111_195; // of latitude
+const CONE_POINTS = 13; // on the rim of a cone
 const LABEL_PIXELS = 20; // height of a label of the graticule
 const SCALE_PIXELS = 40; // height of the scale, with a label above it
 const STREETS_PIXELS = 130; // width of the streets button, with a label beside it
@@ -205,6 +207,17 @@ class PlaceMap {
     const box = L.latLng(latitude, longitude).toBounds(2 * radiusM);
     this.bounds.push(box.getSouthWest(), box.getNorthEast());
     return drawn;
+  }
+
+  /** A sector of so many metres around a direction, `half` degrees to both sides. */
+  cone(latitude, longitude, heading, half, lengthM, kind) {
+    const east = DEGREE_M * Math.cos((latitude * Math.PI) / 180);
+    const rim = Array.from({ length: CONE_POINTS }, (_, index) => {
+      const angle = ((heading + half * ((2 * index) / (CONE_POINTS - 1) - 1)) * Math.PI) / 180;
+      return [latitude + (lengthM * Math.cos(angle)) / DEGREE_M, longitude + (lengthM * Math.sin(angle)) / east];
+    });
+    L.polygon([[latitude, longitude], ...rim], { className: kind, interactive: false }).addTo(this.things);
+    this.bounds.push(...rim);
   }
 
   /** A line through points of latitude and longitude. */

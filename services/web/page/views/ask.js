@@ -7,11 +7,13 @@ import { count, nameOf, percent, plural, score, strength, whereabouts } from "..
 import { stateInWords, watchJob } from "../jobs.js";
 import { localPicture, mayNeedPreview, preview, thumbnail } from "../photo.js";
 import { shrinkPhoto } from "../shrink.js";
+import { drawPose, seenPoints } from "./pose.js";
 import { drawRings, judge, measurementInWords, verdict } from "./verdict.js";
 
 const TOP_K = 12;
 const NEWEST = 14;
 const WAIT_SECONDS = 10;
+const HEADER_BYTES = 256 * 1024;
 const LOOK_MS = 4000; // between two looks at a measurement
 
 export async function showAsk(view, { signal, id }) {
@@ -35,7 +37,12 @@ export async function showAsk(view, { signal, id }) {
     const queryPhoto = {
       name: file.name,
       picture: () => localPicture(file, { alt: `The query photo: ${file.name}` }, shown),
-      find: async (query, onjob) => findSimilar("/similarity", query, await small, onjob, signal, shown && described.resolve),
+      find: async (query, onjob) => {
+        const sent = await small;
+        // A copy has no EXIF; it is answered all the same if that of the original can't be read.
+        const header = sent === file ? {} : await readHeader(file, signal).catch(() => ({}));
+        return findSimilar("/similarity", { ...query, focal_length: header.focal_length }, sent, onjob, signal, shown && described.resolve);
+      },
     };
     view.classList.add("answered");
     return showAnswer(answer, queryPhoto, signal);
@@ -88,6 +95,12 @@ function askEntry(map, onfile, signal) {
   return zone;
 }
 
+/** What the header of a photo's file says. */
+export async function readHeader(file, signal) {
+  const response = await ask("/photo-headers", { method: "POST", body: file.slice(0, HEADER_BYTES), headers: { "Content-Type": "application/octet-stream" }, signal });
+  return response.json();
+}
+
 /** The answer to a photo, stored or not; `onjob` is called while it takes longer than a moment,
  * `ondescribed` with the id of the job that has described the photo. */
 export async function findSimilar(path, query, file, onjob, signal, ondescribed = null) {
@@ -121,7 +134,7 @@ async function showAnswer(answer, queryPhoto, signal) {
   let found;
   try {
     const { matching } = await readMap(signal);
-    found = await queryPhoto.find({ top_k: TOP_K, matches: TOP_K, explain: matching !== "off" }, (job) => fill(progress, `The photo is ${stateInWords(job)}.`));
+    found = await queryPhoto.find({ top_k: TOP_K, matches: TOP_K, explain: matching !== "off", pose: true }, (job) => fill(progress, `The photo is ${stateInWords(job)}.`));
   } catch (error) {
     if (signal.aborted) throw error;
     if (mine !== questions) return;
@@ -133,14 +146,14 @@ async function showAnswer(answer, queryPhoto, signal) {
   const { openMap } = await import("../map.js");
   const { compare } = await import("./compare.js");
   const open = (index) => compare(queryPhoto, found, photos, index, signal);
-  const located = photos.some((photo) => photo.latitude !== null);
+  const located = (found.pose?.latitude ?? null) !== null || photos.some((photo) => photo.latitude !== null);
   const ground = h("div", { class: "ground" });
   // Without levels, an estimate has no probabilities.
   const map = !found.estimate.levels.length && judge(found.estimate)[1] !== "No estimate" ? await readMap(signal) : null;
   const measurement = map && map.measurement !== "measured" ? h("p", { class: "reason" }) : null;
   fill(answer,
     h("section", { class: "result" },
-      h("figure", { class: "query-photo" }, queryPhoto.picture(), h("figcaption", {}, queryPhoto.name)),
+      h("figure", { class: "query-photo" }, queryPhoto.picture(), seenPoints(found.pose), h("figcaption", {}, queryPhoto.name)),
       h("div", { class: "verdict-column" }, verdict(found, measurement)),
       located ? ground : null),
     h("section", {},
@@ -152,7 +165,7 @@ async function showAnswer(answer, queryPhoto, signal) {
     followMeasurement(measurement, map, askAgain, () => mine === questions && answer.isConnected, signal);
   }
   announce(`${answer.querySelector(".badge").textContent}. ${plural(photos.length, "similar photo")}.`);
-  if (located) await drawAnswer(openMap, ground, found.estimate, photos, open, signal);
+  if (located) await drawAnswer(openMap, ground, found, photos, open, signal);
 }
 
 const readMap = (signal) => get(`/maps/${encodeURIComponent(currentMap())}`, { signal });
@@ -182,9 +195,10 @@ function byProbability(photos) {
 
 const hasProbability = (photo) => photo.match_probability !== null;
 
-async function drawAnswer(openMap, ground, estimate, photos, open, signal) {
+async function drawAnswer(openMap, ground, { estimate, pose }, photos, open, signal) {
   const map = await openMap(ground, "Where the matches were taken", { signal });
   drawRings(map, estimate);
+  drawPose(map, pose);
   // From the last to the first, so that the best lies on top.
   photos.map((photo, index) => ({ photo, index })).reverse().forEach(({ photo, index }) => {
     if (photo.latitude !== null) map.numbered(photo.latitude, photo.longitude, index + 1, `${index + 1}: ${nameOf(photo)}`, () => open(index));

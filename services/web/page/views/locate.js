@@ -1,13 +1,12 @@
 // Locate a folder: proposals for photos without coordinates, in a table and on the map, as CSV or GPX.
 
-import { ask, currentMap, get } from "../api.js";
+import { currentMap, get } from "../api.js";
 import { announce, bar, button, field, fill, h, note, noteError } from "../dom.js";
 import { takesDrops, withoutHidden } from "../drop.js";
 import { count, degrees, metres, nameOf, percent, plural } from "../format.js";
 import { shrinkPhoto } from "../shrink.js";
-import { findSimilar } from "./ask.js";
+import { findSimilar, readHeader as headerOf } from "./ask.js";
 
-const HEADER_BYTES = 256 * 1024;
 const SIMILAR = 50;
 const WITH_COORDINATES = "-90,-180,90,180"; // a box around all photos with coordinates
 const AT_ONCE = 3;
@@ -118,9 +117,8 @@ async function readHeader(photo, signal) {
     photo.error = "The file is empty.";
     return;
   }
-  const response = await ask("/photo-headers", { method: "POST", body: photo.file.slice(0, HEADER_BYTES), headers: { "Content-Type": "application/octet-stream" }, signal });
-  const { captured_at: time, time_zone_is_known: zoned, ...header } = await response.json();
-  Object.assign(photo, header, { clock: time && { time: Date.parse(time), zoned } });
+  const { captured_at: time, time_zone_is_known: zoned, focal_length: focal, ...header } = await headerOf(photo.file, signal);
+  Object.assign(photo, header, { clock: time && { time: Date.parse(time), zoned }, focal });
 }
 
 /** Set `captured_at` by the cameras' clocks: those without a time zone show that of `zone`, and those
@@ -146,14 +144,15 @@ function toUtc(shown, zone) {
 async function search(photo, map, signal) {
   const file = await shrinkPhoto(photo.file, map.extractor);
   const find = (query) => findSimilar("/similarity", { top_k: SIMILAR, history: false, ...query }, file, () => {}, signal);
-  const found = await find({});
+  const found = await find({ pose: true, focal_length: photo.focal });
   // Photos of the map without coordinates, such as this one, hide those that have some.
   const { similar_images: similar } = found.matches_without_place ? await find({ box: WITH_COORDINATES }) : found;
-  const { estimate } = found;
+  const { estimate, pose } = found;
   photo.search = {
     similar: similar.filter(({ latitude }) => latitude !== null).map((match) => ({ name: nameOf(match), latitude: match.latitude, longitude: match.longitude, score: match.weighted_score ?? match.similarity_score })),
     circles: estimate.levels.filter(({ radius_m: radius }) => radius !== null).map(({ latitude, longitude, radius_m, probability }) => ({ latitude, longitude, radius_m, probability })),
     not_in_map: estimate.not_in_map_probability ?? 0.02,
+    pose: pose?.radius_68_m == null ? null : { latitude: pose.latitude, longitude: pose.longitude, radius_68_m: pose.radius_68_m, heading: pose.heading },
   };
 }
 
@@ -171,7 +170,7 @@ function readTrack(text, name) {
 }
 
 async function proposePositions(photos, track, options, signal) {
-  const sent = photos.map(({ file, error, clock, ...photo }) => photo);
+  const sent = photos.map(({ file, error, clock, focal, ...photo }) => photo);
   const located = sent.filter(({ latitude }) => latitude !== null);
   const others = sent.filter(({ latitude }) => latitude === null);
   const proposals = [];
@@ -224,7 +223,7 @@ async function drawResult(result, photos, proposals, least, signal) {
 
 // An apostrophe before what a spreadsheet would run as a formula: `placewise index --csv` removes it.
 const quoted = (text) => `"${text.replace(/^(?='*[=+@\t\r-])/, "'").replaceAll('"', '""')}"`;
-const csvOf = (accepted) => ["filename,latitude,longitude", ...accepted.map(({ name, latitude, longitude }) => `${quoted(name)},${latitude},${longitude}`), ""].join("\n");
+const csvOf = (accepted) => ["filename,latitude,longitude,heading", ...accepted.map(({ name, latitude, longitude, heading }) => `${quoted(name)},${latitude},${longitude},${heading ?? ""}`), ""].join("\n");
 
 function gpxOf(accepted, photos) {
   const times = new Map(photos.map(({ name, captured_at: time }) => [name, time]));

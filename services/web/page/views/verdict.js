@@ -4,6 +4,7 @@ import { post } from "../api.js";
 import { button, h } from "../dom.js";
 import { count, degrees, metres, percent, plural } from "../format.js";
 import { coordinateTools } from "../places.js";
+import { poseInWords } from "./pose.js";
 
 const RINGS = [[0.95, "radius_95_m", "ring-95"], [0.68, "radius_68_m", "ring-68"]];
 const MOST_SURE = 99;
@@ -17,6 +18,7 @@ export function verdict(found, measurement) {
   return h("div", { class: `verdict ${kind}` },
     h("p", { class: "badge" }, title),
     kind === "unknown" ? null : whereabouts(estimate),
+    poseInWords(found.pose),
     measurement ?? h("p", { class: "reason" }, bars ? reason(estimate, kind, bars) : estimate.reason),
     without > 0 && without < found.total_similar && h("p", { class: "soft" }, `${count(without)} of these ${plural(found.total_similar, "photo")} ${without === 1 ? "has" : "have"} neither coordinates nor a label. The estimate is that of the photos that have.`),
     bars && kind !== "unknown" && [drawBars(bars), ringsInWords(estimate)],
@@ -27,6 +29,7 @@ export function verdict(found, measurement) {
         h("dt", {}, "Compared"), h("dd", {}, `${count(found.rows_scanned)} rows, ${found.certificate}`),
         h("dt", {}, "Ranked by"), h("dd", {}, found.word_weights === "applied" ? "similarity, with word weights" : "similarity"),
         h("dt", {}, "Took"), h("dd", {}, `${found.processing_time_ms.toFixed(0)} ms`),
+        (found.no_pose ?? found.pose?.reason) && [h("dt", {}, "Pose"), h("dd", {}, found.no_pose ?? found.pose.reason)],
         h("dt", {}, "Vocabulary"), h("dd", {}, found.vocabulary))),
     anyFound && found.vocabulary === "foreign" && h("p", { class: "hint" }, "This map uses a vocabulary fitted on photos of other places. ", h("a", { href: "#/model" }, "Fit its own"), " and the right place comes first more often."),
     anyFound && found.vocabulary === "provisional" && h("p", { class: "hint" }, "This map’s vocabulary was fitted on too few photos. ", h("a", { href: "#/model" }, "Fit it again"), " when it has 50 or more."),
