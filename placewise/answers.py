@@ -322,6 +322,60 @@ class Progress(Answer):
     failed: int
 
 
+class Component(Answer):
+    """Photos that were reconstructed together, in a frame of their own."""
+
+    number: int
+    photos: int
+    points: int
+    mean_reprojection_error_pixels: float
+    """of photos whose longer side has 640 pixels"""
+    latitude: float | None
+    """of the middle of its photos; None if it is not aligned"""
+    longitude: float | None
+    altitude_m: float | None
+    metres_per_unit: float | None
+    alignment_rms_m: float | None
+    not_aligned: str | None
+    """why it is not aligned"""
+    calibration: dict[str, Any] | None
+    """errors of the poses of its own photos, in standard deviations"""
+
+
+class Reconstruction(Answer):
+    """The reconstruction of a map's photos; components are sorted by their number of photos."""
+
+    reconstruction_id: UUID
+    job_id: UUID
+    generation_id: UUID
+    map_version: int
+    features_model: str
+    imported: bool
+    components: list[Component]
+    proposals: int
+    """number of `coordinate_proposals` that are not accepted"""
+    created_at: datetime
+    finished_at: datetime
+
+
+class CoordinateProposal(Answer):
+    """A photo whose coordinates disagree with the reconstruction."""
+
+    image_id: UUID
+    original_filename: str
+    relative_path: str | None
+    latitude: float
+    """when it was reconstructed"""
+    longitude: float
+    proposed_latitude: float
+    proposed_longitude: float
+    distance_m: float
+    radius_95_m: float
+    """of the proposed coordinates"""
+    accepted: bool
+    """whether the photo has the proposed coordinates now"""
+
+
 class Job(Answer):
     """A job.
 

@@ -440,6 +440,52 @@ class AsyncClient(AsyncTransport):
         path = f"/generations/{generation_id}/descriptors"
         await self._download(path, file, on_received, **({"features": True} if features else {}))
 
+    async def reconstruct(self, *, anew: bool = False) -> answers.Started:
+        """Start reconstructing the map's photos, or registering new ones into its reconstruction.
+
+        Args:
+            anew: Reconstruct all photos again.
+        """
+        return answers.Started(**await self._call("POST", "/reconstructions", json={"anew": anew}))
+
+    async def import_reconstruction(self, model: Json) -> answers.Started:
+        """Start using the cameras and poses of a COLMAP model for the map's photos.
+
+        Args:
+            model: `cameras` and `photos`, as `POST /reconstructions/import` describes them.
+        """
+        return answers.Started(**await self._call("POST", "/reconstructions/import", json=model))
+
+    async def reconstruction(self) -> answers.Reconstruction:
+        """Get the map's reconstruction.
+
+        Raises:
+            NotFound: `no_reconstruction`, with the reason.
+        """
+        return answers.Reconstruction(**await self._call("GET", "/reconstructions"))
+
+    async def coordinate_proposals(self, reconstruction_id: Id) -> list[answers.CoordinateProposal]:
+        """List the photos whose coordinates disagree with a reconstruction, largest distance first.
+
+        Nothing is changed; `patch_photo` accepts one.
+        """
+        answer = await self._call("GET", f"/reconstructions/{reconstruction_id}/proposals")
+        return [answers.CoordinateProposal(**each) for each in answer["proposals"]]
+
+    async def export_colmap(
+        self,
+        reconstruction_id: Id,
+        file: BinaryIO,
+        on_received: Callable[[int], object] = lambda received_bytes: None,
+    ) -> None:
+        """Download a tar with the COLMAP model of each component into a file.
+
+        Args:
+            file: Seekable and writable; overwritten from its beginning.
+            on_received: Called with the number of bytes received so far.
+        """
+        await self._download(f"/reconstructions/{reconstruction_id}/colmap", file, on_received)
+
     async def learn_word_weights(self, /, generation_id: Id, **options: int) -> answers.Started:
         """Start fitting word weights of the active generation; options are `sample` and `seed`."""
         path = f"/generations/{generation_id}/word-weights"

@@ -50,7 +50,7 @@ PHOTO_PROPERTIES = {
 }
 
 app = typer.Typer(
-    help="Export a map's descriptors, retrieval pairs for hloc, or photos as GeoJSON."
+    help="Export a map's descriptors, its reconstruction, pairs for hloc, or photos as GeoJSON."
 )
 
 
@@ -121,6 +121,46 @@ def _active_generation_id(client: Client) -> UUID:
             "The map has no photos with descriptors yet. Upload photos: placewise index.",
         )
     return generation.generation_id
+
+
+@app.command("colmap")
+def colmap(
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR", file_okay=False, help="Output folder; created if it does not exist."
+        ),
+    ],
+    map_name: MapOption = None,
+    server: ServerOption = None,
+    key: KeyOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Export the map's reconstruction as a COLMAP model of each component: DIR/0, DIR/1, ...
+
+    Images have the path or file name of their photo, and the photo's ID where that is not unique.
+    """
+    with connect(server, map_name, key) as client, progress_bar() as progress:
+        made = client.reconstruction()
+        receiving = progress.add_task("receiving (bytes)", total=None)
+        with refuse_unwritable(out):
+            out.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=out) as received:
+                client.export_colmap(
+                    made.reconstruction_id,
+                    received,
+                    lambda size: progress.update(receiving, completed=size),
+                )
+                received.seek(0)
+                with tarfile.open(fileobj=received, mode="r:") as tar:
+                    tar.extractall(out, filter="data")
+    photos = sum(component.photos for component in made.components)
+    folder = printable_path(out)
+    print_result(
+        {"folder": folder, "components": len(made.components), "photos": photos},
+        as_json,
+        f"{folder}: {photos} photos in {len(made.components)} COLMAP models.",
+    )
 
 
 @app.command("pairs")

@@ -2,7 +2,8 @@
 
 `FitWorker` runs in a thread of its own. It chooses the photos or rows to fit on, lets a child
 compute the fit (`compute_fit`), and creates the vocabulary or whitening with its generation in one
-transaction. Nothing is stored before: a fit whose worker dies starts again.
+transaction. Nothing is stored before: a fit whose worker dies starts again. The thread also runs
+reconstructions, which store their steps (`services.extractor.geometry.job`).
 """
 
 from __future__ import annotations
@@ -21,11 +22,12 @@ from services.extractor.added_models import AddedModelLoader
 from services.extractor.child_process import run_in_child
 from services.extractor.decoder_pool import DecoderPool
 from services.extractor.describe import read_chunk_row
+from services.extractor.geometry.job import ReconstructionJob
 from services.extractor.handlers import ExtractorContext
 from services.extractor.model_changes import NewVocabulary, map_extractor, start_generation
 from services.extractor.model_registry import DescriptorPipeline, ModelRegistry
 from shared.catalog.chunks import Descriptor, find_descriptor_rows
-from shared.catalog.jobs import FIT_JOBS
+from shared.catalog.jobs import CHILD_PROCESS_JOBS
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.tables import open_catalog
 from shared.catalog.vocabularies import VocabularyOrigin, get_pca_source_generation
@@ -169,7 +171,7 @@ def compute_in_child(
 
 
 class FitWorker:
-    """Runs vocabulary and PCA fits one after the other."""
+    """Runs vocabulary fits, PCA fits and reconstructions one after the other."""
 
     def __init__(
         self,
@@ -182,17 +184,22 @@ class FitWorker:
         self._catalog = context.catalog
         self._models = context.models
         self._compute = compute
-        self._runner = JobRunner(context.catalog, context.settings, name, FIT_JOBS, on_outcome)
+        self._runner = JobRunner(
+            context.catalog, context.settings, name, CHILD_PROCESS_JOBS, on_outcome
+        )
 
     def run(self, stop: threading.Event) -> None:
-        """Run fits until `stop` is set."""
-        self._runner.run_jobs(lambda job: self._fit(job, stop), stop)
+        """Run jobs until `stop` is set."""
+        self._runner.run_jobs(lambda job: self._run(job, stop), stop)
 
     def run_next(self, stop: threading.Event) -> bool:
-        """Run the next fit; False when there is none."""
-        return self._runner.run_next(lambda job: self._fit(job, stop))
+        """Run the next job; False when there is none."""
+        return self._runner.run_next(lambda job: self._run(job, stop))
 
-    def _fit(self, job: Job, stop: threading.Event) -> None:
+    def _run(self, job: Job, stop: threading.Event) -> None:
+        if job.kind == JobKind.RECONSTRUCT:
+            ReconstructionJob(self.context, job, stop).run()
+            return
         fit = self._fit_vocabulary if job.kind == JobKind.FIT else self._fit_whitening
         fit(job, stop)
 

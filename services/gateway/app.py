@@ -34,6 +34,7 @@ from services.gateway.routes import (
     photos,
     positions,
     presigned_uploads,
+    reconstructions,
     similarity,
     stats,
     tracks,
@@ -78,6 +79,7 @@ RESOURCES = (
     model_changes,
     models,
     evaluations,
+    reconstructions,
     export,
     stats,
     keys,
@@ -107,7 +109,10 @@ def create_app(gateway: GatewayContext) -> FastAPI:
         BodySizeLimitMiddleware,
         form_paths=form_paths(),
         exempt_paths={f"{API_PREFIX}{batches.BATCH_UPLOAD_PATH}"},
-        limits={f"{API_PREFIX}{positions.POSITIONS_PATH}": positions.MAX_BODY_BYTES},
+        limits={
+            f"{API_PREFIX}{positions.POSITIONS_PATH}": positions.MAX_BODY_BYTES,
+            f"{API_PREFIX}{reconstructions.IMPORT_PATH}": reconstructions.MAX_MODEL_BYTES,
+        },
     )
     app.add_middleware(RateLimitMiddleware, limiter=app.state.rate_limiter)
     app.add_middleware(AuthenticationMiddleware, authenticator=gateway.authenticator)

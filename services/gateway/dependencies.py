@@ -348,6 +348,7 @@ GenerationId = Annotated[UUID, _uuid_or_not_found("generation")]
 KeyId = Annotated[UUID, _uuid_or_not_found("key")]
 TrackId = Annotated[UUID, _uuid_or_not_found("track")]
 FrameId = Annotated[UUID, _uuid_or_not_found("frame")]
+ReconstructionId = Annotated[UUID, _uuid_or_not_found("reconstruction")]
 WebhookId = Annotated[UUID, _uuid_or_not_found("webhook")]
 
 

@@ -346,6 +346,7 @@ JOB_LABELS = {
     JobKind.SWITCH: "Switch",
     JobKind.PCA: "PCA",
     JobKind.ADD_MODEL: "New model",
+    JobKind.RECONSTRUCT: "Reconstruction",
     JobKind.EVALUATE: "Evaluation",
     JobKind.WORD_WEIGHTS: "Word weights",
     JobKind.BATCH: "Batch",

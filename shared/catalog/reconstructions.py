@@ -21,6 +21,10 @@ from shared.ids import new_id
 from shared.storage import ObjectStore
 from shared.storage.keys import reconstruction_prefix
 
+MIN_PHOTOS = 3
+MAX_PHOTOS = 3000
+"""Of a map that is reconstructed: the time of bundle adjustment grows faster than their number"""
+
 
 class ComponentAlignment(BaseModel):
     """How a component lies on the earth."""

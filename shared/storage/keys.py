@@ -148,6 +148,10 @@ def reconstruction_prefix(reconstruction_id: UUID) -> str:
     return f"{RECONSTRUCTIONS}{reconstruction_id}/"
 
 
+def matches_key(reconstruction_id: UUID) -> str:
+    return f"{reconstruction_prefix(reconstruction_id)}matches.npz"
+
+
 def component_key(reconstruction_id: UUID, number: int) -> str:
     """Return the key of a component; its COLMAP model is in the folder of the same name."""
     return f"{reconstruction_prefix(reconstruction_id)}{number}.npz"

@@ -167,6 +167,48 @@ def _quantile(ratios: Floats, level: float, normal: float) -> float:
     return max(normal, float(ratios[-1]) if len(ratios) else normal)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ComponentPhotos:
+    """A component with the arguments of `localise_left_out`."""
+
+    component: Component
+    features: Mapping[UUID, LocalFeatures]
+    descriptors: NDArray[np.float32]
+    seconds: Floats
+    focal_lengths: Sequence[float | None]
+    similarity: Similarity | None
+
+
+def calibrate_components(
+    parts: Sequence[ComponentPhotos], matcher: Matcher, on_progress: Callable[[int], None]
+) -> list[PoseCalibration]:
+    """Calibrate the poses in each component.
+
+    Args:
+        on_progress: Called with the number of photos of all components that are done.
+    """
+    found: list[PoseCalibration] = []
+    done = 0
+
+    def report(count: int) -> None:
+        on_progress(done + count)
+
+    for part in parts:
+        poses = localise_left_out(
+            part.component,
+            part.features,
+            part.descriptors,
+            part.seconds,
+            part.focal_lengths,
+            matcher,
+            part.similarity,
+            report,
+        )
+        done += len(poses)
+        found.append(calibrate(poses))
+    return found
+
+
 def propose_coordinates(
     component: Component, alignment: Alignment, sigmas_m: Floats
 ) -> list[CoordinateProposal]:

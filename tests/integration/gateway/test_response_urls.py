@@ -56,6 +56,15 @@ def operations_with_urls(openapi: dict[str, Any]) -> set[str]:
     }
 
 
+COLMAP: dict[str, Any] = {
+    "cameras": [{"model": "PINHOLE", "width": 64, "height": 48, "params": [50, 50, 32, 24]}],
+    "photos": [
+        {"name": f"{n}.jpg", "camera": 0, "rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}
+        for n in range(3)
+    ],
+}
+
+
 class Followed:
     """Calls of the API on one map; every URL in an answer is followed as it stands."""
 
@@ -150,6 +159,8 @@ def test_every_url_in_an_answer_leads_to_its_map(service: Service) -> None:
     call.cancel(call("start_generation", "POST", "/generations", json=params))
     call("add_model", "POST", "/models", files=file, data={"name": "one"})
     call("evaluate", "POST", "/evaluations")
+    call.cancel(call("reconstruct", "POST", "/reconstructions"))
+    call.cancel(call("import_reconstruction", "POST", "/reconstructions/import", json=COLMAP))
     path = f"/generations/{similar['generation_id']}/word-weights"
     call("learn_word_weights", "POST", path)
 

@@ -18,7 +18,16 @@ from pydantic import BaseModel
 import placewise
 from placewise import answers
 from services.gateway import schemas
-from services.gateway.routes import batches, evaluations, keys, maps, models, positions, tracks
+from services.gateway.routes import (
+    batches,
+    evaluations,
+    keys,
+    maps,
+    models,
+    positions,
+    reconstructions,
+    tracks,
+)
 from services.gateway.routes import stats as stats_module
 from services.gateway.tracks.schemas import TrackStateResponse
 from shared.search_api.protocol import PointPair, SeenPoint
@@ -44,6 +53,9 @@ SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
     (answers.DeletedTrack, tracks.DeletedTrackResponse),
     (answers.PhotoHeader, positions.PhotoHeaderResponse),
     (answers.Proposal, positions.ProposalResponse),
+    (answers.Component, reconstructions.ComponentResponse),
+    (answers.Reconstruction, reconstructions.ReconstructionResponse),
+    (answers.CoordinateProposal, reconstructions.CoordinateProposalResponse),
     (answers.Progress, schemas.JobProgress),
     (answers.Job, schemas.JobResponse),
     (answers.Started, schemas.JobAcceptedResponse),

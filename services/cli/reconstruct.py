@@ -1,0 +1,211 @@
+"""`placewise reconstruct`: a model of the map's photos, in which queries have a pose."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+from uuid import UUID
+
+import typer
+from rich.markup import escape
+from rich.progress import Progress
+from rich.table import Column
+
+from placewise.answers import CoordinateProposal, Reconstruction
+from placewise.client import Client
+from services.cli.client import client_command, connect, wait_for_job
+from services.cli.ingest.geotags import find_photos
+from services.cli.ingest.upload import upload_photos
+from services.cli.output import (
+    Json,
+    JsonOption,
+    KeyOption,
+    MapOption,
+    ServerOption,
+    Table,
+    format_percent,
+    print_failures,
+    print_json,
+    print_message,
+    print_note,
+    print_table,
+    progress_bar,
+)
+from shared.errors import Conflict, InvalidRequest
+from shared.geometry.colmap_model import ColmapModel, read_colmap_model
+
+MAX_NAMES_SHOWN = 5
+
+
+class ProposalAction(StrEnum):
+    LIST = "list"
+    ACCEPT = "accept"
+    UNDO = "undo"
+
+
+def reconstruct(
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            "--import",
+            metavar="MODEL",
+            exists=True,
+            file_okay=False,
+            help="Folder of a COLMAP model (cameras and images, .bin or .txt), such as hloc's, "
+            "whose poses are used.",
+        ),
+    ] = None,
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            exists=True,
+            file_okay=False,
+            help="With --import: upload the photos of this folder first.",
+        ),
+    ] = None,
+    anew: Annotated[
+        bool,
+        typer.Option(
+            "--anew",
+            help="Reconstruct all photos again, instead of adding new ones to the present model.",
+        ),
+    ] = False,
+    proposals: Annotated[
+        ProposalAction | None,
+        typer.Option(
+            help="List the photos whose coordinates disagree with the reconstruction, accept the "
+            "proposed coordinates, or undo that. Nothing is reconstructed.",
+        ),
+    ] = None,
+    map_name: MapOption = None,
+    server: ServerOption = None,
+    key: KeyOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Reconstruct the map's photos, so that queries have a pose.
+
+    Photos that show the same are reconstructed together and aligned to their coordinates. A later
+    run adds the photos that are new. Interrupted, it goes on from its last step.
+    """
+    options = {"--import": model, "--images": images, "--anew": anew}
+    given = [name for name, value in options.items() if value]
+    if (images and not model) or (proposals and given) or (model and anew):
+        raise InvalidRequest(
+            "options_contradict",
+            "--images goes with --import; --anew and --proposals go with no other option.",
+        )
+    poses = read_colmap_model(model) if model else None  # fails before anything is uploaded
+    with ExitStack() as stack:
+        client = stack.enter_context(connect(server, map_name, key))
+        progress = stack.enter_context(progress_bar())
+        if proposals is not None:
+            changed = _apply_proposals(client, proposals, progress)
+            progress.stop()
+            _print_proposals(changed, proposals, as_json)
+            return
+        if images is not None:
+            photos = find_photos(images, None, None, places_by_folder=False)
+            print_failures(upload_photos(client, photos, progress), "refused", "failed")
+        job = wait_for_job(client, _start(client, poses, anew), progress, "reconstructing")
+        made = client.reconstruction()
+    if as_json:
+        print_json({**made.as_json(), "result": job.result})
+        return
+    _print_reconstruction(made, job.result or {})
+    if made.proposals:
+        options_shown = ("reconstruct", "--proposals", "list")
+        command = client_command(*options_shown, server=server, map_name=map_name)
+        print_note(f"The coordinates of {made.proposals} photos disagree with it: {command}")
+
+
+def _start(client: Client, poses: ColmapModel | None, anew: bool) -> UUID:
+    """Start the job; without a model, return one that is running, as this command has left it."""
+    if poses is not None:
+        return client.import_reconstruction(poses.model_dump(mode="json")).job_id
+    try:
+        return client.reconstruct(anew=anew).job_id
+    except Conflict as error:
+        if error.code != "reconstruction_running":
+            raise
+        print_note("The map is being reconstructed already: waiting for that job.")
+        return UUID(error.extra["job_id"])
+
+
+def _print_reconstruction(made: Reconstruction, result: Json) -> None:
+    table = Table(
+        "component",
+        Column("photos", justify="right"),
+        Column("points", justify="right"),
+        Column("error", justify="right", no_wrap=True),
+        Column("found again", justify="right", no_wrap=True),
+        "alignment",
+    )
+    for each in made.components:
+        share = each.calibration["share_found"] if each.calibration else None
+        table.add_row(
+            str(each.number),
+            str(each.photos),
+            str(each.points),
+            f"{each.mean_reprojection_error_pixels:.2f} px",
+            "" if share is None else format_percent(share),
+            escape(each.not_aligned or f"{each.alignment_rms_m:.2f} m from the coordinates"),
+        )
+    print_table(table)
+    photos = sum(each.photos for each in made.components)
+    print_message(
+        f"{photos} of {result['photos']} photos are in {len(made.components)} components."
+    )
+    if unmatched := result.get("unmatched_names"):
+        shown = ", ".join(unmatched[:MAX_NAMES_SHOWN]) + " ..." * (len(unmatched) > MAX_NAMES_SHOWN)
+        print_note(
+            f"{result['unmatched']} names of the model are not those of exactly one photo of the "
+            f"map: {shown}"
+        )
+
+
+def _apply_proposals(
+    client: Client, action: ProposalAction, progress: Progress
+) -> list[CoordinateProposal]:
+    """Accept or undo proposals; return those that were changed, or all open ones."""
+    proposals = client.coordinate_proposals(client.reconstruction().reconstruction_id)
+    chosen = [each for each in proposals if each.accepted == (action == ProposalAction.UNDO)]
+    if action != ProposalAction.LIST:
+        for each in progress.track(chosen, description="changing"):
+            undo = action == ProposalAction.UNDO
+            client.patch_photo(
+                each.image_id,
+                latitude=each.latitude if undo else each.proposed_latitude,
+                longitude=each.longitude if undo else each.proposed_longitude,
+            )
+    return chosen
+
+
+def _print_proposals(
+    proposals: list[CoordinateProposal], action: ProposalAction, as_json: bool
+) -> None:
+    if as_json:
+        print_json([each.as_json() for each in proposals])
+        return
+    if action != ProposalAction.LIST:
+        print_message(f"The coordinates of {len(proposals)} photos were changed.")
+        return
+    table = Table(
+        "photo",
+        Column("coordinates", no_wrap=True),
+        Column("proposed", no_wrap=True),
+        Column("distance", justify="right", no_wrap=True),
+        Column("95 %", justify="right", no_wrap=True),
+    )
+    for each in proposals:
+        table.add_row(
+            escape(each.relative_path or each.original_filename),
+            f"{each.latitude:.6f}, {each.longitude:.6f}",
+            f"{each.proposed_latitude:.6f}, {each.proposed_longitude:.6f}",
+            f"{each.distance_m:.1f} m",
+            f"{each.radius_95_m:.1f} m",
+        )
+    print_table(table)
+    print_note("Nothing was changed. --proposals accept changes the coordinates in the map.")

@@ -1,0 +1,532 @@
+"""Job that reconstructs the photos of a map, step by step.
+
+    match pairs ──> matches.npz ──> reconstruct ──> components ──> align, calibrate ──> finished row
+
+Each step ends with what it stores: the matches as an object, the components as objects and in the
+row of the reconstruction, the rest in the row alone. A job that was interrupted continues after the
+last one. All but the reading runs in child processes of low priority.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from services.extractor.child_process import run_in_child
+from services.extractor.geometry.calibrate import MAX_PHOTOS as MAX_PHOTOS_LEFT_OUT
+from services.extractor.geometry.calibrate import (
+    ComponentPhotos,
+    CoordinateProposal,
+    calibrate_components,
+    propose_coordinates,
+)
+from services.extractor.geometry.mapping import (
+    MappedComponent,
+    PhotoToMap,
+    import_model,
+    map_photos,
+    require_pycolmap,
+)
+from services.extractor.geometry.matching import VerifiedMatches, match_pairs
+from services.extractor.geometry.pairs import choose_pairs
+from services.extractor.handlers import ExtractorContext
+from shared.catalog.chunks import Chunk, Descriptor, find_features_model
+from shared.catalog.database.base import db_now
+from shared.catalog.generations import Generation, active_generation
+from shared.catalog.maps import Map
+from shared.catalog.photos import Photo, PhotoRole
+from shared.catalog.reconstructions import (
+    MAX_PHOTOS,
+    MIN_PHOTOS,
+    ComponentAlignment,
+    ReconstructedComponent,
+    Reconstruction,
+    current_reconstruction,
+)
+from shared.errors import Conflict, NotFound, Unprocessable
+from shared.geometry.cameras import Floats
+from shared.geometry.colmap_model import ColmapModel
+from shared.geometry.component import Component
+from shared.geometry.frames import GPS_SIGMA_M, Alignment, align
+from shared.geometry.radius import PoseCalibration
+from shared.ids import new_id
+from shared.jobs import Job
+from shared.jobs.leases import lock_leased_job
+from shared.jobs.progress import JobProgress
+from shared.jobs.runner import JobInterrupted
+from shared.jobs.transitions import succeed_job
+from shared.matching.features import LocalFeatures
+from shared.matching.matchers import MutualNearest
+from shared.storage.chunks import features_key, read_chunk
+from shared.storage.feature_files import read_feature_index, read_feature_rows
+from shared.storage.keys import component_key, matches_key, reconstruction_prefix
+
+PROGRESS_UNITS = 100
+MATCHED, MAPPED = 40, 80  # units of progress after these steps
+MAX_NAMES_REPORTED = 100  # names of an imported model that no photo has
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapPhoto:
+    """A photo of the map with what the steps need of it."""
+
+    row: Photo
+    features: LocalFeatures
+    descriptor: NDArray[np.floating[Any]]
+
+    def to_map(self) -> PhotoToMap:
+        size = self.features.width, self.features.height
+        pixels = self.features.pixels().astype(np.float32)
+        return PhotoToMap(self.row.id, *size, pixels, self.row.focal_length)
+
+
+class ReconstructionJob:
+    """One run of a claimed job; `run` continues after the step that the last run ended with."""
+
+    def __init__(self, context: ExtractorContext, job: Job, stop: threading.Event) -> None:
+        self._catalog, self._store = context.catalog, context.store
+        self._job = job
+        self._progress = JobProgress(context.catalog, job, stop, total=PROGRESS_UNITS)
+
+    def run(self) -> None:
+        """Reconstruct the map, and mark the job as succeeded.
+
+        Raises:
+            Misconfigured: `pose_missing` without the extra `pose`.
+            Conflict: `too_few_photos`, `too_many_photos`, `no_local_features`.
+            Unprocessable: `empty_model`: the photos have too few matches.
+        """
+        require_pycolmap()
+        made = self._begin()
+        photos = self._read_photos(made)
+        result: dict[str, Any] = {"reconstruction_id": str(made.id), "photos": len(photos)}
+        model = None
+        if self._job.params["object_key"] is not None:
+            model, unmatched = self._read_model(photos)
+            names = model.names()
+            photos = {id_: photo for id_, photo in photos.items() if str(id_) in names}
+            result["unmatched"] = len(unmatched)
+            result["unmatched_names"] = unmatched[:MAX_NAMES_REPORTED]
+        matches = self._match(made, photos)
+        components = self._load_components(made, photos)
+        if components is None:
+            made, components = self._map(made, photos, matches, model)
+        self._finish(made, components, photos, result)
+
+    def _begin(self) -> Reconstruction:
+        """Return the reconstruction of an earlier run of the job, or a new one."""
+        with self._catalog.write() as session:
+            active, model = _get_features(session, self._job.map_id)
+            begun = session.scalar(
+                select(Reconstruction).where(
+                    Reconstruction.job_id == self._job.id,
+                    Reconstruction.finished_at.is_(None),
+                    Reconstruction.features_model == model,
+                )
+            )
+            if begun is None:
+                begun = Reconstruction(
+                    id=new_id(),
+                    map_id=self._job.map_id,
+                    job_id=self._job.id,
+                    generation_id=active.id,
+                    map_version=session.get_one(Map, self._job.map_id).version,
+                    features_model=model,
+                    imported=self._job.params["object_key"] is not None,
+                )
+                session.add(begun)
+                session.flush()
+            return begun
+
+    def _read_photos(self, made: Reconstruction) -> dict[UUID, MapPhoto]:
+        """Read the searchable photos that have local features of the reconstruction's model."""
+        self._progress.update(0, "pairs")
+        chunks = (
+            select(Chunk, Descriptor.row, Photo)
+            .join(Descriptor, Descriptor.chunk_id == Chunk.id)
+            .join(Photo, Photo.id == Descriptor.photo_id)
+            .where(
+                Descriptor.generation_id == made.generation_id,
+                Chunk.features_model == made.features_model,
+                Photo.deleted_at.is_(None),
+                Photo.role == PhotoRole.DATABASE,
+            )
+            .order_by(Chunk.id, Descriptor.row)
+        )
+        with self._catalog.read() as session:
+            located = session.execute(chunks).all()
+        if not MIN_PHOTOS <= len(located) <= MAX_PHOTOS:
+            raise Conflict(
+                "too_few_photos" if len(located) < MIN_PHOTOS else "too_many_photos",
+                f"The map has {len(located)} photos with local features, and a reconstruction "
+                f"takes {MIN_PHOTOS} to {MAX_PHOTOS}.",
+            )
+        photos = {}
+        for chunk, rows in groupby(located, lambda row: row[0]):
+            self._progress.check()
+            of_chunk = {row: photo for _, row, photo in rows}
+            descriptors = read_chunk(self._store, chunk.object_key, chunk.sha256)
+            key = features_key(chunk.object_key)
+            index = read_feature_index(self._store, key)
+            for row, data in read_feature_rows(self._store, key, index, of_chunk).items():
+                photo = of_chunk[row]
+                features = LocalFeatures.decode(data)
+                photos[photo.id] = MapPhoto(photo, features, descriptors[row])
+        return dict(sorted(photos.items()))
+
+    def _match(self, made: Reconstruction, photos: dict[UUID, MapPhoto]) -> VerifiedMatches:
+        """Match the photos, unless an earlier run has; pairs of the present model are known."""
+        key = matches_key(made.id)
+        if (stored := self._load_matches(key)) is not None:
+            return stored
+        current = None if self._job.params["anew"] else self._current()
+        known = self._load_matches(matches_key(current.id)) if current else None
+        pairs = choose_pairs(
+            np.array([photo.descriptor for photo in photos.values()], np.float32),
+            _seconds(photos.values()),
+            _numbers(photo.row.latitude for photo in photos.values()),
+            _numbers(photo.row.longitude for photo in photos.values()),
+        )
+        ids = list(photos)
+        if known is not None:
+            was_there = np.isin([str(id_) for id_ in ids], [str(id_) for id_ in known.photo_ids])
+            pairs = pairs[~was_there[pairs].all(axis=1)]
+
+        def report(done: int) -> None:
+            self._progress.update(MATCHED * done // max(1, len(pairs)), "match")
+
+        matches = run_in_child(
+            match_pairs,
+            {id_: photo.features for id_, photo in photos.items()},
+            pairs,
+            MutualNearest.of_model(made.features_model),
+            on_progress=report,
+            check=self._progress.check,
+        )
+        if known is not None:
+            matches = _join_matches(matches, known)
+        self._store.put(key, matches.encode())
+        self._end_step()
+        return matches
+
+    def _load_matches(self, key: str) -> VerifiedMatches | None:
+        try:
+            return VerifiedMatches.decode(self._store.get(key))
+        except NotFound:
+            return None
+
+    def _current(self) -> Reconstruction | None:
+        """Return the reconstruction that new photos are registered into."""
+        with self._catalog.read() as session:
+            found = current_reconstruction(session, self._job.map_id)
+        return found if isinstance(found, Reconstruction) else None
+
+    def _map(
+        self,
+        made: Reconstruction,
+        photos: dict[UUID, MapPhoto],
+        matches: VerifiedMatches,
+        model: ColmapModel | None,
+    ) -> tuple[Reconstruction, list[Component]]:
+        """Reconstruct, and store the components."""
+        to_map = [photo.to_map() for photo in photos.values()]
+        self._progress.update(MATCHED, "map")
+
+        def report(tried: int) -> None:
+            share = min(1.0, tried / len(to_map))
+            self._progress.update(MATCHED + int(share * (MAPPED - MATCHED)), "map")
+
+        with TemporaryDirectory(prefix="placewise-reconstruct-") as scratch:
+            folder = Path(scratch, "made")
+            folder.mkdir()
+            if model is None:
+                existing = self._fetch_models(Path(scratch), photos)
+                found = map_photos(to_map, matches, folder, report, self._progress.check, existing)
+            else:
+                source = Path(scratch, "model")
+                source.mkdir()
+                model.write(source)
+                names = {name: UUID(name) for name in model.names()}
+                found = import_model(to_map, names, matches, folder, source, self._progress.check)
+            stored = [
+                self._store_component(made.id, number, each) for number, each in enumerate(found)
+            ]
+        with self._catalog.write() as session:
+            self._lock(session)
+            made = session.get_one(Reconstruction, made.id)
+            made.components = [each.model_dump(mode="json") for each in stored]
+        return made, [each.component for each in found]
+
+    def _fetch_models(self, scratch: Path, photos: dict[UUID, MapPhoto]) -> list[Path]:
+        """Fetch the models that new photos are registered into; none if all are made anew.
+
+        They are if a photo of the present reconstruction was deleted or has lost its features.
+        """
+        current = None if self._job.params["anew"] else self._current()
+        folders = []
+        for component in current.list_components() if current else ():
+            stored = Component.decode(self._store.get(component.object_key))
+            if not photos.keys() >= set(stored.photo_ids):
+                return []
+            folder = scratch / f"existing-{component.number}"
+            folder.mkdir()
+            for key in component.sha256:
+                if key != component.object_key:
+                    (folder / key.rpartition("/")[2]).write_bytes(self._store.get(key))
+            folders.append(folder)
+        return folders
+
+    def _read_model(self, photos: dict[UUID, MapPhoto]) -> tuple[ColmapModel, list[str]]:
+        """Return the imported model with photo ids as names, and the names without a photo."""
+        sent = ColmapModel.model_validate_json(self._store.get(self._job.params["object_key"]))
+        rows = [photo.row for photo in photos.values()]
+        paths = {row.id: row.relative_path or row.filename for row in rows}
+        ids = match_names([photo.name for photo in sent.photos], paths)
+        if len(ids) < MIN_PHOTOS:
+            raise Unprocessable(
+                "names_unmatched",
+                f"{len(ids)} of the {len(sent.photos)} names in the model are those of exactly one "
+                f"photo of the map, for example not {sent.photos[0].name!r:.200}. Upload the "
+                "model's images: `placewise reconstruct --import MODEL --images DIR`.",
+            )
+        named = [
+            photo.model_copy(update={"name": str(ids[photo.name])})
+            for photo in sent.photos
+            if photo.name in ids
+        ]
+        unmatched = [photo.name for photo in sent.photos if photo.name not in ids]
+        return sent.model_copy(update={"photos": named}), unmatched
+
+    def _store_component(
+        self, made_id: UUID, number: int, mapped: MappedComponent
+    ) -> ReconstructedComponent:
+        key = component_key(made_id, number)
+        objects = {key: mapped.component.encode()}
+        for file in sorted(mapped.folder.iterdir()):
+            objects[f"{reconstruction_prefix(made_id)}{number}/{file.name}"] = file.read_bytes()
+        for name, data in objects.items():
+            self._store.put(name, data)
+        return ReconstructedComponent(
+            number=number,
+            object_key=key,
+            sha256={name: hashlib.sha256(data).hexdigest() for name, data in objects.items()},
+            photos=len(mapped.component.photo_ids),
+            points=len(mapped.component.points),
+            mean_reprojection_error_pixels=mapped.mean_reprojection_error_pixels,
+        )
+
+    def _load_components(
+        self, made: Reconstruction, photos: dict[UUID, MapPhoto]
+    ) -> list[Component] | None:
+        """Return the stored components; None without, or if one of their photos is gone."""
+        stored = [
+            Component.decode(self._store.get(each.object_key)) for each in made.list_components()
+        ]
+        is_complete = all(photos.keys() >= set(component.photo_ids) for component in stored)
+        return stored if stored and is_complete else None
+
+    def _finish(
+        self,
+        made: Reconstruction,
+        components: list[Component],
+        photos: dict[UUID, MapPhoto],
+        result: dict[str, Any],
+    ) -> None:
+        """Align and calibrate the components, and finish row and job in one transaction."""
+        self._progress.update(MAPPED, "align")
+        alignments = [_align(component, photos) for component in components]
+        calibrations = self._calibrate(made, components, alignments, photos)
+        stored, proposals = [], list[dict[str, Any]]()
+        for about, component, alignment, calibration in zip(
+            made.list_components(), components, alignments, calibrations, strict=True
+        ):
+            about = about.model_copy(update={"calibration": calibration.model_dump()})
+            if isinstance(alignment, str):
+                stored.append(about.model_copy(update={"not_aligned": alignment}))
+                continue
+            origin = alignment.origin
+            aligned = ComponentAlignment(
+                origin=(origin.latitude, origin.longitude, origin.altitude_m),
+                similarity=alignment.similarity.as_json(),
+                rms_m=alignment.rms_m,
+            )
+            stored.append(about.model_copy(update={"alignment": aligned}))
+            sigmas_m = np.full(len(component.photo_ids), GPS_SIGMA_M)
+            for each in propose_coordinates(component, alignment, sigmas_m):
+                proposals.append(_to_json(each, photos[each.photo].row))
+        result |= {
+            "reconstructed": sum(each.photos for each in stored),
+            "components": len(stored),
+            "aligned": sum(each.alignment is not None for each in stored),
+            "proposals": len(proposals),
+        }
+        with self._catalog.write() as session:
+            leased = self._lock(session)
+            made = session.get_one(Reconstruction, made.id)
+            made.components = [each.model_dump(mode="json") for each in stored]
+            made.proposals = proposals
+            made.finished_at = session.scalar(select(db_now()))
+            leased.progress_total = PROGRESS_UNITS
+            succeed_job(leased, result)
+
+    def _calibrate(
+        self,
+        made: Reconstruction,
+        components: list[Component],
+        alignments: list[Alignment | str],
+        photos: dict[UUID, MapPhoto],
+    ) -> list[PoseCalibration]:
+        total = sum(min(len(component.photo_ids), MAX_PHOTOS_LEFT_OUT) for component in components)
+
+        def report(done: int) -> None:
+            units = MAPPED + (PROGRESS_UNITS - MAPPED) * done // max(1, total)
+            self._progress.update(units, "calibrate")
+
+        parts = []
+        for component, alignment in zip(components, alignments, strict=True):
+            of_component = [photos[id_] for id_ in component.photo_ids]
+            part = ComponentPhotos(
+                component,
+                {photo.row.id: photo.features for photo in of_component},
+                np.array([photo.descriptor for photo in of_component], np.float32),
+                _seconds(of_component),
+                [photo.row.focal_length for photo in of_component],
+                None if isinstance(alignment, str) else alignment.similarity,
+            )
+            parts.append(part)
+        matcher = MutualNearest.of_model(made.features_model)
+        return run_in_child(
+            calibrate_components, parts, matcher, on_progress=report, check=self._progress.check
+        )
+
+    def _end_step(self) -> None:
+        """Note that a step is stored: workers that died before it do not count any more."""
+        with self._catalog.write() as session:
+            self._lock(session).attempts = 0
+
+    def _lock(self, session: Session) -> Job:
+        leased = lock_leased_job(session, self._job)
+        if leased is None:
+            raise JobInterrupted
+        return leased
+
+
+def _get_features(session: Session, map_id: UUID) -> tuple[Generation, str]:
+    """Return the active generation and the model of its local features."""
+    active = active_generation(session, map_id)
+    model = find_features_model(session, active.id) if active else None
+    if active is None or model is None:
+        raise Conflict(
+            "no_local_features",
+            "The map's photos have no local features, of which a reconstruction is made. Switch "
+            "matching on: placewise maps update NAME --matching on.",
+        )
+    return active, model
+
+
+def _align(component: Component, photos: Mapping[UUID, MapPhoto]) -> Alignment | str:
+    """Return the alignment of a component to its photos' coordinates, or why there is none.
+
+    The fit takes the photos in the order in which they were taken; the alignment has them in the
+    component's.
+    """
+    of_component = [photos[id_] for id_ in component.photo_ids]
+    order = np.argsort(_seconds(of_component), kind="stable")  # those without a time come last
+    rows = [of_component[i].row for i in order]
+    found = align(
+        component.centres()[order],
+        [component.rotation(i) for i in order],
+        _numbers(row.latitude for row in rows),
+        _numbers(row.longitude for row in rows),
+        _numbers(row.altitude for row in rows),
+        np.full(len(rows), GPS_SIGMA_M),
+    )
+    if isinstance(found, str):
+        return f"{found[0].upper()}{found[1:]}."
+    back = np.argsort(order)
+    return replace(found, residuals_m=found.residuals_m[back], is_inlier=found.is_inlier[back])
+
+
+def _seconds(photos: Iterable[MapPhoto]) -> Floats:
+    """Return when the photos were taken; NaN where that is unknown."""
+    times = (photo.row.captured_at for photo in photos)
+    return _numbers(None if time is None else time.timestamp() for time in times)
+
+
+def _numbers(values: Iterable[float | None]) -> Floats:
+    return np.array([np.nan if value is None else value for value in values], float)
+
+
+def _to_json(proposal: CoordinateProposal, photo: Photo) -> dict[str, Any]:
+    return {
+        "photo_id": str(photo.id),
+        "latitude": photo.latitude,
+        "longitude": photo.longitude,
+        "proposed_latitude": proposal.latitude,
+        "proposed_longitude": proposal.longitude,
+        "distance_m": proposal.distance_m,
+        "radius_95_m": proposal.radius_95_m,
+    }
+
+
+def _join_matches(new: VerifiedMatches, known: VerifiedMatches) -> VerifiedMatches:
+    """Return the matches of both; photos of `known` that are gone have none."""
+    numbers = {id_: number for number, id_ in enumerate(new.photo_ids)}
+    kept = [
+        (pair, keypoints)
+        for row, keypoints in zip(known.pairs.tolist(), known.keypoints, strict=True)
+        if (pair := [numbers.get(known.photo_ids[number], -1) for number in row]) and min(pair) >= 0
+    ]
+    pairs = np.array([*new.pairs.tolist(), *(pair for pair, _ in kept)], np.int32)
+    return replace(
+        new,
+        pairs=pairs.reshape(-1, 2),
+        keypoints=(*new.keypoints, *(keypoints for _, keypoints in kept)),
+    )
+
+
+def match_names(names: Sequence[str], paths: Mapping[UUID, str]) -> dict[str, UUID]:
+    """Return the photos of the image names of a model, as far as exactly one has each name.
+
+    A name is that of a photo if one of both paths ends with the other: `day 1/a.jpg` is `a.jpg` and
+    `walk/day 1/a.jpg`. Of several such photos it is the one with the same path.
+
+    Args:
+        names: Of the images.
+        paths: Relative path, or else file name, by photo.
+    """
+    by_file_name = defaultdict[str, list[UUID]](list)
+    for id_, path in paths.items():
+        by_file_name[path.rpartition("/")[2]].append(id_)
+    found: dict[str, UUID] = {}
+    for name in names:
+        parts = _path_parts(name)
+        fitting = []
+        for id_ in by_file_name[parts[0]]:
+            others = _path_parts(paths[id_])
+            common = min(len(parts), len(others))
+            if parts[:common] == others[:common]:
+                fitting.append(id_)
+        same = [id_ for id_ in fitting if _path_parts(paths[id_]) == parts]
+        if len(fitting) == 1 or len(same) == 1:
+            found[name] = (same or fitting)[0]
+    times = Counter(found.values())
+    return {name: id_ for name, id_ in found.items() if times[id_] == 1}
+
+
+def _path_parts(path: str) -> list[str]:
+    """Return the parts of a path from its end."""
+    return path.replace("\\", "/").split("/")[::-1]

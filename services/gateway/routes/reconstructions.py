@@ -1,0 +1,362 @@
+"""Routes of reconstructions: make one of the map's photos or of a COLMAP model, read, export it."""
+
+from __future__ import annotations
+
+import tarfile
+from collections import Counter
+from collections.abc import Iterator
+from datetime import datetime
+from typing import Any
+from uuid import UUID
+
+from fastapi import APIRouter
+from fastapi.responses import StreamingResponse
+from pydantic import Field
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from services.gateway.admission import ADMIT_JOB
+from services.gateway.authentication import READ, WRITE
+from services.gateway.dependencies import GatewayContext, GatewayDep, MapQuery, ReconstructionId
+from services.gateway.idempotency import IdempotentDep, IdempotentRequest
+from services.gateway.schemas import JobAcceptedResponse, RequestModel, ResponseModel
+from shared.catalog.chunks import count_searchable, find_features_model
+from shared.catalog.database.base import get_in_map
+from shared.catalog.generations import active_generation
+from shared.catalog.jobs import UNFINISHED_STATES
+from shared.catalog.maps import get_map, lock_map
+from shared.catalog.photos import Photo
+from shared.catalog.reconstructions import (
+    MAX_PHOTOS,
+    MIN_PHOTOS,
+    ReconstructedComponent,
+    Reconstruction,
+    current_reconstruction,
+)
+from shared.errors import Conflict, NotFound
+from shared.geodesy import distance_m
+from shared.geometry.colmap_model import ColmapModel, rename_images
+from shared.ids import new_id
+from shared.jobs import Job, JobKind, Priority
+from shared.storage.keys import new_checkpoint_key
+
+router = APIRouter(tags=["reconstructions"])
+
+IMPORT_PATH = "/reconstructions/import"
+MAX_MODEL_BYTES = 16_000_000
+"""Of cameras and poses as JSON; a pose takes about 300 bytes"""
+COORDINATE_TOLERANCE_M = 0.02
+TAR_RESPONSE: dict[int | str, dict[str, Any]] = {
+    200: {
+        "content": {"application/x-tar": {"schema": {"type": "string", "format": "binary"}}},
+        "description": "A tar with a folder for each component: `0/cameras.bin`, `0/images.bin`, "
+        "`0/points3D.bin`, `0/frames.bin`, `0/rigs.bin`, `1/...`.",
+    }
+}
+
+
+class ReconstructRequest(RequestModel):
+    anew: bool = Field(
+        False,
+        description="Reconstruct all photos again. By default, new photos are registered into the "
+        "map's reconstruction.",
+    )
+
+
+class ComponentResponse(ResponseModel):
+    """Photos that were reconstructed together, in a frame of their own."""
+
+    number: int
+    photos: int
+    points: int
+    mean_reprojection_error_pixels: float = Field(
+        description="of photos whose longer side has 640 pixels"
+    )
+    latitude: float | None = Field(
+        description="of the middle of its photos; null if it is not aligned"
+    )
+    longitude: float | None
+    altitude_m: float | None = Field(description="null also if its photos have no altitudes")
+    metres_per_unit: float | None = Field(description="metres in a unit of its frame")
+    alignment_rms_m: float | None = Field(
+        description="root mean square distance between its photos and their coordinates"
+    )
+    not_aligned: str | None = Field(description="why it is not aligned")
+    calibration: dict[str, Any] | None = Field(
+        description="errors of the poses of its own photos, each found again without itself, in "
+        "standard deviations (`position_68`, `position_95`, `heading_68`, `heading_95`), the share "
+        "that was found (`share_found`), and the number of `poses` that this rests on"
+    )
+
+    @classmethod
+    def of(cls, component: ReconstructedComponent) -> ComponentResponse:
+        alignment = component.alignment
+        latitude, longitude, altitude = alignment.origin if alignment else (None, None, None)
+        similarity = alignment.similarity if alignment else {}
+        return cls.of_row(
+            component,
+            latitude=latitude,
+            longitude=longitude,
+            altitude_m=altitude if similarity.get("knows_altitude") else None,
+            metres_per_unit=similarity.get("scale"),
+            alignment_rms_m=alignment and alignment.rms_m,
+        )
+
+
+class ReconstructionResponse(ResponseModel):
+    reconstruction_id: UUID = Field(validation_alias="id")
+    job_id: UUID
+    generation_id: UUID
+    map_version: int = Field(description="version of the map when its photos were read")
+    features_model: str = Field(description="model of the local features that it is made of")
+    imported: bool = Field(description="whether its poses come from an imported COLMAP model")
+    components: list[ComponentResponse] = Field(description="largest first")
+    proposals: int = Field(
+        description="number of photos whose coordinates disagree with it, without accepted ones: "
+        "`GET /reconstructions/{reconstruction_id}/proposals`"
+    )
+    created_at: datetime
+    finished_at: datetime
+
+
+class CoordinateProposalResponse(ResponseModel):
+    """A photo whose coordinates disagree with the reconstruction."""
+
+    image_id: UUID
+    original_filename: str
+    relative_path: str | None
+    latitude: float = Field(description="when it was reconstructed")
+    longitude: float
+    proposed_latitude: float
+    proposed_longitude: float
+    distance_m: float = Field(description="between both")
+    radius_95_m: float = Field(description="that contains the true place with 95 %")
+    accepted: bool = Field(description="whether the photo has the proposed coordinates now")
+
+
+class CoordinateProposalsResponse(ResponseModel):
+    proposals: list[CoordinateProposalResponse] = Field(description="largest distance first")
+
+
+@router.post(
+    "/reconstructions",
+    operation_id="reconstruct",
+    status_code=202,
+    dependencies=[WRITE, ADMIT_JOB],
+)
+def start_reconstruction(
+    gateway: GatewayDep,
+    idempotent: IdempotentDep,
+    query: MapQuery,
+    options: ReconstructRequest | None = None,
+) -> JobAcceptedResponse:
+    """Reconstruct the map's photos: poses of their cameras, and points in space.
+
+    Each component, photos that were reconstructed together, is aligned to the coordinates of its
+    photos. Queries with `pose=true` then have a pose. The job's `result` counts photos and
+    components; a job that is interrupted continues from its last step.
+    """
+    anew = options is not None and options.anew
+    return _queue(gateway, query.map, idempotent, {"object_key": None, "anew": anew})
+
+
+@router.post(
+    IMPORT_PATH,
+    operation_id="import_reconstruction",
+    status_code=202,
+    dependencies=[WRITE, ADMIT_JOB],
+)
+def start_import(
+    gateway: GatewayDep, idempotent: IdempotentDep, query: MapQuery, model: ColmapModel
+) -> JobAcceptedResponse:
+    """Use the cameras and poses of an existing COLMAP model, such as hloc's, for the map's photos.
+
+    Upload its images first. Each name in the model is compared with the path and the file name of
+    the photos; the job's `result` lists the names that no photo or several photos have. Points are
+    triangulated from the map's local features.
+    """
+    key = new_checkpoint_key()
+    gateway.store.put(key, model.model_dump_json().encode())
+    return _queue(gateway, query.map, idempotent, {"object_key": key, "anew": True})
+
+
+def _queue(
+    gateway: GatewayContext, map_name: str, idempotent: IdempotentRequest, params: dict[str, Any]
+) -> JobAcceptedResponse:
+    with gateway.catalog.write() as session:
+        map_id = lock_map(session, get_map(session, map_name).id).id
+        _check_reconstructable(session, map_id)
+        job = Job(
+            id=new_id(),
+            map_id=map_id,
+            kind=JobKind.RECONSTRUCT,
+            priority=Priority.MODEL_CHANGE,
+            params=params,
+        )
+        accepted = idempotent.accept_job(session, job)
+    gateway.wakeups.send()
+    return accepted
+
+
+def _check_reconstructable(session: Session, map_id: UUID) -> None:
+    running = session.scalar(
+        select(Job.id).where(
+            Job.map_id == map_id,
+            Job.kind == JobKind.RECONSTRUCT,
+            Job.state.in_(UNFINISHED_STATES),
+        )
+    )
+    if running is not None:
+        raise Conflict(
+            "reconstruction_running",
+            f"The map is being reconstructed already (job {running}). Wait for it, or cancel it: "
+            f"POST /api/v1/jobs/{running}/cancel.",
+            job_id=str(running),
+        )
+    active = active_generation(session, map_id)
+    photos = count_searchable(session, active.id) if active else 0
+    if active is None or photos < MIN_PHOTOS:
+        raise Conflict(
+            "too_few_photos",
+            f"The map has {photos} described photos, and a reconstruction needs {MIN_PHOTOS}. "
+            "Upload photos, and wait for their jobs.",
+        )
+    if photos > MAX_PHOTOS:
+        raise Conflict(
+            "too_many_photos",
+            f"The map has {photos} photos, and a reconstruction takes at most {MAX_PHOTOS}: its "
+            "time grows faster than their number. Make a map of each site or floor.",
+        )
+    if find_features_model(session, active.id) is None:
+        raise Conflict(
+            "no_local_features",
+            "The map's photos have no local features, of which a reconstruction is made. Switch "
+            'matching on: PATCH /api/v1/maps/{name} with {"matching": "on"}, or `placewise maps '
+            "set NAME --matching on`.",
+        )
+
+
+@router.get("/reconstructions", operation_id="get_reconstruction", dependencies=[READ])
+def read_reconstruction(gateway: GatewayDep, query: MapQuery) -> ReconstructionResponse:
+    """Get the reconstruction in which queries of the map find their pose now.
+
+    404 (`no_reconstruction`) if there is none, or if it is of other local features than the map
+    has now.
+    """
+    with gateway.catalog.read() as session:
+        found = current_reconstruction(session, get_map(session, query.map).id)
+        if isinstance(found, str):
+            raise NotFound("no_reconstruction", found)
+        return ReconstructionResponse.of_row(
+            found,
+            components=list(map(ComponentResponse.of, found.list_components())),
+            proposals=sum(not each.accepted for each in _list_proposals(session, found)),
+        )
+
+
+@router.get(
+    "/reconstructions/{reconstruction_id}/proposals",
+    operation_id="list_coordinate_proposals",
+    dependencies=[READ],
+)
+def read_proposals(
+    gateway: GatewayDep, reconstruction_id: ReconstructionId, query: MapQuery
+) -> CoordinateProposalsResponse:
+    """List the photos whose coordinates disagree with the reconstruction, with proposed ones.
+
+    Nothing is changed: `PATCH /uploads/{file_id}` accepts one, and undoes that. A photo that has
+    other coordinates by now is not listed.
+    """
+    with gateway.catalog.read() as session:
+        found = _get_finished(session, query.map, reconstruction_id)
+        return CoordinateProposalsResponse(proposals=_list_proposals(session, found))
+
+
+def _list_proposals(
+    session: Session, reconstruction: Reconstruction
+) -> list[CoordinateProposalResponse]:
+    by_id = {UUID(each["photo_id"]): each for each in reconstruction.proposals}
+    photos = session.scalars(select(Photo).where(Photo.id.in_(by_id), Photo.deleted_at.is_(None)))
+    found = []
+    for photo in photos:
+        proposal = by_id[photo.id]
+        is_as_before, is_accepted = (
+            photo.latitude is not None
+            and photo.longitude is not None
+            and distance_m(photo.latitude, photo.longitude, *place) < COORDINATE_TOLERANCE_M
+            for place in (
+                (proposal["latitude"], proposal["longitude"]),
+                (proposal["proposed_latitude"], proposal["proposed_longitude"]),
+            )
+        )
+        if is_as_before or is_accepted:
+            found.append(
+                CoordinateProposalResponse(
+                    image_id=photo.id,
+                    original_filename=photo.filename,
+                    relative_path=photo.relative_path,
+                    accepted=is_accepted,
+                    **{name: value for name, value in proposal.items() if name != "photo_id"},
+                )
+            )
+    return sorted(found, key=lambda each: -each.distance_m)
+
+
+def _get_finished(session: Session, map_name: str, reconstruction_id: UUID) -> Reconstruction:
+    map_id = get_map(session, map_name).id
+    found = get_in_map(session, Reconstruction, map_id, reconstruction_id)
+    if found.finished_at is None:
+        raise NotFound(
+            "reconstruction_not_found",
+            f"The reconstruction {reconstruction_id} is still being made.",
+            reconstruction_id=str(reconstruction_id),
+        )
+    return found
+
+
+@router.get(
+    "/reconstructions/{reconstruction_id}/colmap",
+    operation_id="export_colmap",
+    dependencies=[READ],
+    response_class=StreamingResponse,
+    responses=TAR_RESPONSE,
+)
+def export_colmap(
+    gateway: GatewayDep, reconstruction_id: ReconstructionId, query: MapQuery
+) -> StreamingResponse:
+    """Download the COLMAP models of the components as a tar archive.
+
+    Images have the path or the file name of their photo; where two photos share it, and for deleted
+    photos, they have the photo's id.
+    """
+    with gateway.catalog.read() as session:
+        found = _get_finished(session, query.map, reconstruction_id)
+        of_map = select(Photo.id, Photo.relative_path, Photo.filename).where(
+            Photo.map_id == found.map_id, Photo.deleted_at.is_(None)
+        )
+        names = {str(row[0]): row[1] or row[2] for row in session.execute(of_map)}
+        keys = [key for key in found.list_object_keys(gateway.store) if key.endswith(".bin")]
+        made_at = found.created_at
+    shared = Counter(names.values())
+
+    def image_name(photo_id: str) -> str:
+        name = names.get(photo_id, photo_id)
+        return name if shared[name] == 1 and name.isprintable() else photo_id
+
+    def stream() -> Iterator[bytes]:
+        for key in sorted(keys):
+            data = gateway.store.get(key)
+            if key.endswith("/images.bin"):
+                data = rename_images(data, image_name)
+            entry = tarfile.TarInfo("/".join(key.split("/")[-2:]))
+            entry.size, entry.mtime = len(data), int(made_at.timestamp())
+            yield entry.tobuf(tarfile.GNU_FORMAT) + data + bytes(-len(data) % tarfile.BLOCKSIZE)
+        yield bytes(2 * tarfile.BLOCKSIZE)
+
+    return StreamingResponse(
+        stream(),
+        media_type="application/x-tar",
+        headers={
+            "Content-Disposition": f'attachment; filename="reconstruction-{found.id}.tar"',
+        },
+    )
