@@ -154,9 +154,9 @@ def _print_reconstruction(made: Reconstruction, result: Json) -> None:
             escape(each.not_aligned or f"{each.alignment_rms_m:.2f} m from the coordinates"),
         )
     print_table(table)
-    photos = sum(each.photos for each in made.components)
     print_message(
-        f"{photos} of {result['photos']} photos are in {len(made.components)} components."
+        f"{result['reconstructed']} of {result['photos']} photos are in {len(made.components)} "
+        "components."
     )
     if unmatched := result.get("unmatched_names"):
         shown = ", ".join(unmatched[:MAX_NAMES_SHOWN]) + " ..." * (len(unmatched) > MAX_NAMES_SHOWN)

@@ -14,8 +14,11 @@ import psutil
 
 from lab.benchmarks.invariants import check_invariants, count_unfinished_jobs
 from shared.catalog.database.session import Catalog
-from shared.storage import FolderStore
+from shared.storage import FolderStore, ObjectInfo
+from shared.storage.keys import RECONSTRUCTIONS
+from tests.support.local_features import add_features
 from tests.support.photos import photo_bytes
+from tests.support.reconstructed_scene import ReconstructedScene
 from tests.support.server import ServerProcess
 from tests.support.servers.daemon import has_ended
 
@@ -105,6 +108,32 @@ def test_a_fit_that_is_killed_starts_again_after_the_restart(tmp_path: Path) -> 
         assert job["state"] == "succeeded", job
         assert job["result"]["photos"] == 40
         assert server.client.get("/api/v1/database/stats").json()["vocabulary"] == "provisional"
+
+
+def test_a_reconstruction_that_is_killed_continues_after_its_last_step(tmp_path: Path) -> None:
+    scene = ReconstructedScene()
+    with ServerProcess(tmp_path / "home") as server:
+        ids = [UUID(server.indexed(photo_bytes(number))) for number in range(scene.photos)]
+        server.kill()
+        catalog = Catalog(f"sqlite:///{server.home / 'catalog.sqlite'}")
+        store = FolderStore(server.home / "objects")
+        add_features(catalog, store, dict(zip(ids, scene.features.values(), strict=True)))
+        catalog.close()
+        server.start()
+        job_id = server.client.post("/api/v1/reconstructions").json()["job_id"]
+        while not (matches := [info for info in _made(store) if info.key.endswith("matches.npz")]):
+            time.sleep(0.002)
+        server.kill()
+        server.start()
+        job = server.finished(job_id)
+        assert job["state"] == "succeeded", job
+        assert job["result"]["reconstructed"] == scene.photos
+        assert matches[0] in _made(store), "the photos were matched again"
+        assert sum(info.key.endswith(".npz") for info in _made(store)) == 2
+
+
+def _made(store: FolderStore) -> list[ObjectInfo]:
+    return list(store.list(RECONSTRUCTIONS))
 
 
 def test_decoding_children_end_with_a_killed_server(tmp_path: Path) -> None:

@@ -368,7 +368,7 @@ class ReconstructionJob:
             for each in propose_coordinates(component, alignment, sigmas_m):
                 proposals.append(_to_json(each, photos[each.photo].row))
         result |= {
-            "reconstructed": sum(each.photos for each in stored),
+            "reconstructed": len({id_ for each in components for id_ in each.photo_ids}),
             "components": len(stored),
             "aligned": sum(each.alignment is not None for each in stored),
             "proposals": len(proposals),
