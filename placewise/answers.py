@@ -139,8 +139,9 @@ class PoseCamera(Answer):
 class CameraPose(Answer):
     """Where the camera of a query stood and looked. Coordinates are WGS 84, angles in degrees.
 
-    `reason` says why they or the radii are None. `position` and `quaternion` (w, x, y, z) are those
-    of the component of the reconstruction.
+    `reason` says why they or the radii are None. `enu_quaternion` (w, x, y, z) leads from forward,
+    left, up to east, north, up. `position` and `quaternion` are in the component of the
+    reconstruction.
     """
 
     latitude: float | None
@@ -152,6 +153,7 @@ class CameraPose(Answer):
     radius_68_m: float | None
     radius_95_m: float | None
     heading_68_degrees: float | None
+    enu_quaternion: tuple[float, float, float, float] | None
     reason: str | None
     component: int
     position: tuple[float, float, float]

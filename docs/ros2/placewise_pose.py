@@ -52,15 +52,9 @@ def ask(server, photo, key="", **parameters):
 
 def write_geopose(stamp, frame_id, pose):
     """Return a serialised GeoPoseWithCovarianceStamped of a body: x forward, y left, z up."""
-    yaw, pitch, roll = 90 - pose["heading"], -pose["pitch"], pose["roll"]
-    (cz, sz), (cy, sy), (cx, sx) = (
-        (math.cos(math.radians(angle) / 2), math.sin(math.radians(angle) / 2))
-        for angle in (yaw, pitch, roll)
-    )
     altitude = pose["altitude_m"]
     place = (pose["latitude"], pose["longitude"], math.nan if altitude is None else altitude)
-    x, y = cz * cy * sx - sz * sy * cx, cz * sy * cx + sz * cy * sx
-    z, w = sz * cy * cx - cz * sy * sx, cz * cy * cx + sz * sy * sx
+    w, x, y, z = pose["enu_quaternion"]
     metres = (pose["radius_68_m"] / RADIUS_68) ** 2
     turn = math.radians(pose["heading_68_degrees"] / ANGLE_68) ** 2
     variances = (metres, metres, UNKNOWN if altitude is None else metres, turn, turn, turn)

@@ -234,6 +234,10 @@ class CameraPoseResponse(ResponseModel):
     heading_68_degrees: float | None = Field(
         description="the true heading differs by at most this with a probability of 68 %"
     )
+    enu_quaternion: tuple[float, float, float, float] | None = Field(
+        description="w, x, y, z of the rotation from the camera's axes forward, left and up to "
+        "east, north and up, as in OGC GeoPose and ROS"
+    )
     reason: str | None = Field(description="why fields above are null; null if none is missing")
     component: int = Field(description="number of the component in the reconstruction")
     position: tuple[float, float, float] = Field(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Iterable
+from dataclasses import asdict
 
 import numpy as np
 from cachetools import LRUCache
@@ -25,7 +26,6 @@ from shared.search_api.protocol import (
     PoseComponent,
     PoseRequest,
     PoseResponse,
-    SeenPoint,
 )
 from shared.storage import ObjectStore
 
@@ -152,7 +152,7 @@ def _to_message(pose: LocalPose, number: int, component: PoseComponent) -> Compo
             "focal_pixels": pose.camera.focal_pixels,
             "camera_source": pose.camera_source,
             "seen": [
-                SeenPoint(query=pixel, point=point)
+                {"query": pixel, "point": point}
                 for pixel, point in zip(pixels.tolist(), points.tolist(), strict=True)
             ],
             "geographic": _geographic(pose, component),
@@ -169,14 +169,5 @@ def _geographic(pose: LocalPose, component: PoseComponent) -> GeographicPose | N
         Similarity.from_json(component.alignment["similarity"]),
         PoseCalibration.model_validate(component.calibration),
     )
-    return GeographicPose(
-        latitude=found.latitude,
-        longitude=found.longitude,
-        altitude_m=found.altitude_m,
-        heading=found.attitude.heading,
-        pitch=found.attitude.pitch,
-        roll=found.attitude.roll,
-        radius_68_m=found.radius_68_m,
-        radius_95_m=found.radius_95_m,
-        heading_68_degrees=found.heading_68_degrees,
-    )
+    values = {**asdict(found), **asdict(found.attitude), "enu_quaternion": found.quaternion}
+    return GeographicPose.model_validate(values)

@@ -294,6 +294,8 @@ class GeographicPose(_Message):
     radius_68_m: float
     radius_95_m: float
     heading_68_degrees: float
+    enu_quaternion: tuple[float, float, float, float]
+    """(w, x, y, z) of `shared.geometry.frames.geopose_rotation`"""
 
 
 class ComponentPose(_Message):

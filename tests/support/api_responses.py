@@ -144,6 +144,7 @@ POSE: dict[str, Any] = {
     "radius_68_m": 0.42,
     "radius_95_m": 0.9,
     "heading_68_degrees": 1.25,
+    "enu_quaternion": [0.83, 0.0, 0.01, 0.56],
     "reason": None,
     "component": 1,
     "position": [0.41, 0.6, -0.1],

@@ -20,7 +20,6 @@ from sqlalchemy.orm import Session
 
 from services.gateway.dependencies import GatewayContext
 from services.gateway.schemas import (
-    CameraPoseResponse,
     EstimateResponse,
     SimilarityResponse,
     SimilarPhotoResponse,
@@ -34,7 +33,7 @@ from services.gateway.similarity.matches import (
     check_matching_enabled,
     match_photos,
 )
-from services.gateway.similarity.pose import estimate_camera_pose
+from services.gateway.similarity.pose import find_pose
 from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import find_descriptor
 from shared.catalog.database.errors import to_unavailable
@@ -46,7 +45,6 @@ from shared.errors import Conflict, Gone, StorageFull
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH, RankedPhoto
 from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import PlaceModel
-from shared.geometry.cameras import CameraSource
 from shared.jobs import Job, JobState
 from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
 from shared.search_api.protocol import (
@@ -385,32 +383,6 @@ def _match_best_photos(
     photo_ids = dict.fromkeys(hit.photo_id for ranking in best for hit in ranking.hits[:count])
     return match_photos(
         search.gateway, query.generation, query.features, list(photo_ids), search_params.explain
-    )
-
-
-def find_pose(
-    gateway: GatewayContext,
-    query: SimilarityQuery,
-    hits: Sequence[SearchHit],
-    search_params: SearchParams,
-) -> CameraPoseResponse | str | None:
-    """Return the pose of a query, or why it has none; None if it was not requested.
-
-    Args:
-        hits: The most similar photos, best first.
-    """
-    if not search_params.pose:
-        return None
-    source = CameraSource.ESTIMATED if query.focal_length is None else CameraSource.EXIF
-    return estimate_camera_pose(
-        gateway,
-        query.map,
-        query.generation,
-        query.features,
-        [hit.photo_id for hit in hits],
-        search_params.focal_length or query.focal_length,
-        CameraSource.GIVEN if search_params.focal_length else source,
-        query.photo_id,
     )
 
 

@@ -6,14 +6,13 @@ to the left and z up, as bodies in ROS have (REP 103), so a camera with yaw 0 lo
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Any
 
 from fastapi import Depends, Request
 from fastapi.responses import JSONResponse
 
 from services.gateway.schemas import CameraPoseResponse, SimilarityResponse
-from services.gateway.similarity.search_params import GeoPoseForm, SearchParams
+from services.gateway.similarity.search_params import SearchParams
 from shared.errors import Unprocessable
 
 MEDIA_TYPE = "application/geopose+json"
@@ -71,7 +70,7 @@ def with_geopose(answer: SimilarityResponse, search_params: SearchParams, wanted
     return JSONResponse(content, media_type=MEDIA_TYPE)
 
 
-def geopose(pose: CameraPoseResponse, form: GeoPoseForm) -> dict[str, dict[str, float]]:
+def geopose(pose: CameraPoseResponse, form: str) -> dict[str, dict[str, Any]]:
     """Return the pose as a GeoPose; Unprocessable (`no_pose`) if it is not complete."""
     if pose.latitude is None or pose.longitude is None:
         raise Unprocessable("no_pose", f"The pose has no coordinates. {pose.reason}")
@@ -83,23 +82,10 @@ def geopose(pose: CameraPoseResponse, form: GeoPoseForm) -> dict[str, dict[str, 
         )
     assert pose.heading is not None
     assert pose.pitch is not None
-    assert pose.roll is not None
+    assert pose.enu_quaternion is not None
     position = {"lat": pose.latitude, "lon": pose.longitude, "h": pose.altitude_m}
-    yaw, pitch, roll = (270 - pose.heading) % 360 - 180, -pose.pitch, pose.roll
-    if form == GeoPoseForm.YPR:
-        return {"position": position, "angles": {"yaw": yaw, "pitch": pitch, "roll": roll}}
-    return {"position": position, "quaternion": _quaternion(yaw, pitch, roll)}
-
-
-def _quaternion(yaw: float, pitch: float, roll: float) -> dict[str, float]:
-    """Return the product of the turns about z, y and x, from the inner to the outer frame."""
-    (cz, sz), (cy, sy), (cx, sx) = (
-        (math.cos(half), math.sin(half))
-        for half in (math.radians(angle) / 2 for angle in (yaw, pitch, roll))
-    )
-    return {
-        "x": cz * cy * sx - sz * sy * cx,
-        "y": cz * sy * cx + sz * cy * sx,
-        "z": sz * cy * cx - cz * sy * sx,
-        "w": cz * cy * cx + sz * sy * sx,
-    }
+    if form == "ypr":
+        yaw = (270 - pose.heading) % 360 - 180
+        angles = {"yaw": yaw, "pitch": -pose.pitch, "roll": pose.roll}
+        return {"position": position, "angles": angles}
+    return {"position": position, "quaternion": dict(zip("wxyz", pose.enu_quaternion, strict=True))}

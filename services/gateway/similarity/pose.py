@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from uuid import UUID
+from typing import TYPE_CHECKING
 
 from services.gateway.dependencies import GatewayContext
 from services.gateway.schemas import CameraPoseResponse, PoseCameraResponse
+from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import find_feature_rows
-from shared.catalog.generations import Generation
-from shared.catalog.maps import Map, Matching
+from shared.catalog.maps import Matching
 from shared.catalog.reconstructions import ReconstructedComponent, current_reconstruction
 from shared.errors import PlacewiseError
 from shared.geometry.cameras import CameraSource
 from shared.search_api.protocol import (
     ComponentPose,
-    FeatureReference,
     GeographicPose,
     PoseCandidate,
     PoseComponent,
     PoseRequest,
+    SearchHit,
 )
+
+if TYPE_CHECKING:
+    from services.gateway.similarity.execute import SimilarityQuery
 
 log = logging.getLogger(__name__)
 
@@ -31,49 +34,43 @@ NOT_CALIBRATED = (
 )
 
 
-def estimate_camera_pose(
+def find_pose(
     gateway: GatewayContext,
-    map_: Map,
-    generation: Generation,
-    query: FeatureReference,
-    photo_ids: Sequence[UUID],
-    focal_length: float | None,
-    camera_source: CameraSource,
-    leave_out: UUID | None,
-) -> CameraPoseResponse | str:
-    """Return the pose of a query, or why it has none, as a sentence.
+    query: SimilarityQuery,
+    hits: Sequence[SearchHit],
+    search_params: SearchParams,
+) -> CameraPoseResponse | str | None:
+    """Return the pose of a query, or why it has none, as a sentence; None if it was not requested.
 
     Args:
-        query: Its local features; they may not exist.
-        photo_ids: The photos of the map that are most similar to it, best first.
-        focal_length: As a multiple of the longer side; None if it is not known.
-        camera_source: Where it comes from.
-        leave_out: The query, if it is a photo of the map.
+        hits: The most similar photos, best first.
     """
-    if map_.matching == Matching.OFF:
+    if not search_params.pose:
+        return None
+    if query.map.matching == Matching.OFF:
         return (
             "The map has no local features: its `matching` is off. Turn it on (`placewise maps "
-            f"update {map_.name} --matching on`), then run `placewise reconstruct`."
+            f"update {query.map.name} --matching on`), then run `placewise reconstruct`."
         )
     with gateway.catalog.read() as session:
-        current = current_reconstruction(session, map_.id)
+        current = current_reconstruction(session, query.map.id)
         if isinstance(current, str):
             return current
-        rows = find_feature_rows(session, generation.id, photo_ids)
+        rows = find_feature_rows(session, query.generation.id, [hit.photo_id for hit in hits])
     components = current.list_components()
-    candidates = tuple(
-        PoseCandidate(photo_id=photo_id, object_key=rows[photo_id][0], row=rows[photo_id][1])
-        for photo_id in photo_ids
-        if photo_id in rows
-    )
+    source = CameraSource.ESTIMATED if query.focal_length is None else CameraSource.EXIF
     request = PoseRequest(
-        query=query,
-        candidates=candidates,
+        query=query.features,
+        candidates=tuple(
+            PoseCandidate(photo_id=photo_id, object_key=rows[photo_id][0], row=rows[photo_id][1])
+            for photo_id in (hit.photo_id for hit in hits)
+            if photo_id in rows
+        ),
         features_model=current.features_model,
         components=tuple(map(_to_message, components)),
-        focal_length=focal_length,
-        camera_source=camera_source,
-        leave_out=(leave_out,) if leave_out else (),
+        focal_length=search_params.focal_length or query.focal_length,
+        camera_source=CameraSource.GIVEN if search_params.focal_length else source,
+        leave_out=(query.photo_id,) if query.photo_id else (),
     )
     try:
         found = gateway.search.estimate_pose(request)

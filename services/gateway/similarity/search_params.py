@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from datetime import datetime
-from enum import StrEnum
+from typing import Literal
 from uuid import UUID
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -135,13 +135,6 @@ def _parse_ids(text: str) -> tuple[UUID, ...]:
     return tuple(ids)
 
 
-class GeoPoseForm(StrEnum):
-    """Form of a GeoPose."""
-
-    QUATERNION = "quaternion"
-    YPR = "ypr"
-
-
 class RankingParams(BaseModel):
     """Number of results of a similarity search, ranking, and limits of its cost."""
 
@@ -182,8 +175,8 @@ class RankingParams(BaseModel):
         description="Focal length of the query's camera, as a multiple of the photo's longer side "
         "(that for 35 mm film, divided by 36). Default: that of the EXIF, or else it is estimated.",
     )
-    geopose: GeoPoseForm = Field(
-        GeoPoseForm.QUATERNION,
+    geopose: Literal["quaternion", "ypr"] = Field(
+        "quaternion",
         description="Form of the answer to `Accept: application/geopose+json`: Basic-Quaternion or "
         "Basic-YPR of OGC GeoPose 1.0.",
     )

@@ -21,11 +21,11 @@ from services.gateway.dependencies import GatewayContext
 from services.gateway.schemas import CameraPoseResponse
 from services.gateway.similarity.execute import (
     SimilarityQuery,
-    find_pose,
     missing_log_odds,
     query_from_job,
     rank_live_photos,
 )
+from services.gateway.similarity.pose import find_pose
 from services.gateway.tracks.catalog_graph import CatalogPhotoGraph
 from services.gateway.tracks.schemas import FrameForm, TrackParams, TrackStateResponse
 from services.gateway.uploads.query_photo import query_expired_error, query_job_search_params

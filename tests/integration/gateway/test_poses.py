@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from dataclasses import replace
+import math
+from dataclasses import asdict, replace
 from io import BytesIO
 from typing import Any
 from uuid import UUID
@@ -16,7 +17,6 @@ from PIL.ExifTags import IFD, Base
 
 from services.gateway.schemas import CameraPoseResponse
 from services.gateway.similarity.geopose import MEDIA_TYPE, geopose
-from services.gateway.similarity.search_params import GeoPoseForm
 from shared.catalog.chunks import Chunk
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map, Matching
@@ -130,6 +130,8 @@ def test_pose_has_coordinates_radii_the_camera_and_the_points_that_were_seen(
     assert pose["heading"] == pytest.approx((HEADING - TURN_DEGREES) % 360, abs=0.3)
     assert 0 < pose["radius_68_m"] < pose["radius_95_m"] < 0.5
     assert 0 < pose["heading_68_degrees"] < 1
+    w, *_, z = pose["enu_quaternion"]
+    assert 2 * math.degrees(math.atan2(z, w)) == pytest.approx(90 - pose["heading"] + 360, abs=0.5)
     assert (pose["component"], pose["reason"]) == (0, None)
     assert np.linalg.norm(np.array(pose["position"]) - CENTRE) < 0.05
     assert pose["camera"]["source"] == "given"
@@ -281,18 +283,17 @@ def test_geopose_turns_as_the_rotation_of_the_camera_does() -> None:
     blank: dict[str, Any] = dict.fromkeys(CameraPoseResponse.model_fields)
     for seed in range(20):
         rotation = rotation_of_vector(np.random.default_rng(seed).normal(0, 1.5, 3))
-        attitude = attitude_of(rotation)
+        quaternion = tuple(quaternion_of(geopose_rotation(rotation)).tolist())
         pose = CameraPoseResponse.model_construct(
             **blank
-            | {"latitude": 1.0, "longitude": 2.0, "altitude_m": 3.0}
-            | {"heading": attitude.heading, "pitch": attitude.pitch, "roll": attitude.roll}
+            | {"latitude": 1.0, "longitude": 2.0, "altitude_m": 3.0, "enu_quaternion": quaternion}
+            | asdict(attitude_of(rotation))
         )
-        angles = geopose(pose, GeoPoseForm.YPR)["angles"]
+        angles = geopose(pose, "ypr")["angles"]
         assert tuple(angles.values()) == pytest.approx(geopose_angles(rotation), abs=1e-6)
-        x, y, z, w = geopose(pose, GeoPoseForm.QUATERNION)["quaternion"].values()
-        quaternion = np.array([w, x, y, z])
-        expected = quaternion_of(geopose_rotation(rotation))
-        assert abs(quaternion @ expected) == pytest.approx(1)
+        assert geopose(pose, "quaternion")["quaternion"] == dict(
+            zip("wxyz", quaternion, strict=True)
+        )
 
 
 def test_pose_without_a_height_is_no_geopose(
