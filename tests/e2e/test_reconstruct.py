@@ -1,6 +1,7 @@
 """`placewise reconstruct` and `export colmap` as a user runs them.
 
-Each test continues the one above. The photos' local features are those of a made-up scene: their pixels show none.
+Each test continues the one above. The photos' local features are those of a made-up scene: their
+pixels show none.
 """
 
 from __future__ import annotations
