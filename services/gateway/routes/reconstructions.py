@@ -232,7 +232,7 @@ def _check_reconstructable(session: Session, map_id: UUID) -> None:
             "no_local_features",
             "The map's photos have no local features, of which a reconstruction is made. Switch "
             'matching on: PATCH /api/v1/maps/{name} with {"matching": "on"}, or `placewise maps '
-            "set NAME --matching on`.",
+            "update NAME --matching on`.",
         )
 
 

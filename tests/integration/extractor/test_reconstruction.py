@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -217,6 +218,19 @@ def test_model_is_made_anew_after_one_of_its_photos_was_deleted(
     service.json("DELETE", f"/uploads/{walk.ids[0]}")
     made = walk.reconstruct()
     assert set(walk.component(made).photo_ids) == set(walk.ids[1:])
+
+
+def test_extractor_without_pycolmap_says_what_to_install(
+    walk: Walk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    job_id = walk.start()
+    walk.run()
+    job = walk.job(job_id)
+    assert job.state == JobState.FAILED
+    assert job.error is not None
+    assert job.error["code"] == "pose_missing"
+    assert "'.[pose]'" in job.error["detail"]
 
 
 class FailingStore:
