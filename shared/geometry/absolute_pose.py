@@ -20,9 +20,12 @@ MIN_PAIRS = 6
 MAX_ERROR_PIXELS = 5.0
 """at WORKING_SIDE, of an inlier"""
 LOSS_SCALE_PIXELS = 1.0
-RANSAC = {"max_reproj_error": MAX_ERROR_PIXELS, "min_iterations": 200, "max_iterations": 5000}
+RANSAC = {"min_iterations": 100, "max_iterations": 3000, "seed": 0}
+SAMPLED_PAIRS = 400
+"""of which poselib finds a start; all refine it"""
 FOCAL_STARTS = (0.55, 0.7, 0.85, 1.05, 1.4, 2.0)
 """Focal lengths in longer sides that are tried if none is known"""
+REFINED_STARTS = 2
 ITERATIONS = 25
 UNKNOWN_FOCAL_SIGMA = 10.0
 """ln: no knowledge at all"""
@@ -67,24 +70,25 @@ def estimate_absolute_pose(
         return None
     unit = max(camera.width, camera.height) / WORKING_SIDE
     options = {**RANSAC, "max_reproj_error": MAX_ERROR_PIXELS * unit}
+    sample = np.random.default_rng(0).permutation(len(pixels))[:SAMPLED_PAIRS]
     starts = [camera.focal_length] if focal_sigma is not None else FOCAL_STARTS
-    best: _Fit | None = None
+    fits = []
     for start in starts:
         tried = camera.with_focal_length(start)
         found, info = poselib.estimate_absolute_pose(
-            pixels, points, tried.as_poselib(), options, {}
+            pixels[sample], points[sample], tried.as_poselib(), options, {}
         )
-        if info["num_inliers"] < MIN_PAIRS:
-            continue
-        rotation = np.array(found.R)
-        fit = _Fit(pixels, points, covariances, tried, rotation, -rotation.T @ np.array(found.t))
-        # The first refinement tells which start is best; the second one needs its inliers.
+        if info["num_inliers"] >= MIN_PAIRS:
+            position = -found.R.T @ found.t
+            fits.append(_Fit(pixels, points, covariances, tried, found.R, position))
+    best: _Fit | None = None
+    for fit in sorted(fits, key=lambda fit: fit.cost)[:REFINED_STARTS]:
         fit.refine(focal_sigma)
         if best is None or fit.cost < best.cost:
             best = fit
     if best is None or best.is_inlier.sum() < MIN_PAIRS:
         return None
-    return best.refine(focal_sigma)
+    return best.pose(focal_sigma)
 
 
 class _Fit:
@@ -117,12 +121,9 @@ class _Fit:
         self.cost = float(np.minimum(squares, MAX_ERROR_PIXELS**2).sum())
         self.is_inlier: NDArray[np.bool_] = squares < MAX_ERROR_PIXELS**2
 
-    def refine(self, focal_sigma: float | None) -> AbsolutePose:
-        """Refine by Gauss-Newton steps that are weighted as Cauchy's loss does (Triggs, 1999).
-
-        The covariance is that of the inliers' Jacobian, scaled by the variance of their errors.
-        """
-        prior = (UNKNOWN_FOCAL_SIGMA if focal_sigma is None else max(focal_sigma, 1e-6)) ** -2
+    def refine(self, focal_sigma: float | None) -> None:
+        """Refine by damped Gauss-Newton steps that are weighted as Cauchy's loss does."""
+        prior = _prior(focal_sigma)
         damping = 1e-3
         for _ in range(ITERATIONS):
             rows, errors, weights = self._linearise()
@@ -150,11 +151,14 @@ class _Fit:
             damping = max(damping / 10, 1e-9)
             if before[3] - self.cost < 1e-6 * self.cost:
                 break
+
+    def pose(self, focal_sigma: float | None) -> AbsolutePose:
+        """Return the pose; its covariance is that of the inliers, scaled by their errors'."""
         rows, errors, _ = self._linearise()
         count = len(errors)
         variance = float(np.sum(errors**2)) / max(1, 2 * count - 7)
         normal = np.einsum("mik,mil->kl", rows, rows) / max(variance, 1e-6)
-        normal[6, 6] += prior
+        normal[6, 6] += _prior(focal_sigma)
         covariance = np.linalg.pinv(normal, hermitian=True)
         return AbsolutePose(
             self.rotation,
@@ -196,3 +200,8 @@ class _Fit:
             errors = np.einsum("mij,mj->mi", whitening, errors)
         weights = 1 / (1 + np.sum(errors**2, axis=1) / LOSS_SCALE_PIXELS**2)
         return rows, errors, weights
+
+
+def _prior(focal_sigma: float | None) -> float:
+    """Return the weight of the focal length that is known."""
+    return (UNKNOWN_FOCAL_SIGMA if focal_sigma is None else max(focal_sigma, 1e-6)) ** -2

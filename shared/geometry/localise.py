@@ -16,11 +16,28 @@ from shared.geometry.component import Component
 from shared.matching.features import LocalFeatures
 from shared.matching.matchers import Matcher
 
-MIN_INLIERS = 12
+MIN_INLIERS = 15
+MIN_INLIER_SHARE = 0.12
+"""of the keypoints that match a point"""
+MIN_EXTENT = 0.03
+"""Standard deviation of the inliers across their line, as a share of the longer side"""
+MAX_SIGMA_OF_DEPTH = 0.2
+"""Largest standard deviation of a position as a share of the distance to what is seen"""
+MAX_DEPTHS = 3.0
+"""Largest distance from the photos that were matched, in distances to what is seen"""
 MIN_COMMON_POINTS = 5
 """Photos that see as many points in common show the same place"""
+MAX_PLACES = 3
+RIVAL_SHARE = 0.6
+"""A place with such a share of the best one's inliers explains the photo about equally well"""
+SAME_POSE_DEPTHS, SAME_POSE_COSINE = 0.3, 0.9
+"""Two poses are the same within this share of the distance to what is seen, and 26 degrees"""
+PANORAMA_RATIO = 1.95
+PLAUSIBLE_FOCAL_LENGTHS = (0.35, 4.0)
 FOCAL_SIGMAS = {CameraSource.GIVEN: 0.01, CameraSource.EXIF: 0.04, CameraSource.MAP: 0.05}
 """Relative standard deviation of a focal length by its source"""
+MAX_FOCAL_SIGMAS = 4.0
+"""Farther off, a focal length contradicts the one that the matches show"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,15 +53,15 @@ class LocalPose:
     covariance: Floats
     """(6, 6) of the centre, and of a turn of the camera in the frame (radians)"""
     inliers: int
-    """pairs of a keypoint and a point that agree with the pose"""
+    """keypoints of which a point agrees with the pose"""
     matches: int
-    """all pairs"""
+    """keypoints that match a point"""
     camera: Camera
     camera_source: CameraSource
     seen_points: Floats
-    """(inliers, 3) in the frame"""
+    """(m, 3) in the frame"""
     seen_pixels: Floats
-    """(inliers, 2) where they are in the photo"""
+    """(m, 2) where they are in the photo"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +79,13 @@ class _Pairs:
     component: int
     photos: tuple[int, ...]
     """rows of the photos that they were matched with"""
+    keypoint_numbers: NDArray[np.int32]
     pixels: Floats
     point_numbers: NDArray[np.int32]
+
+    def keypoints(self, pose: AbsolutePose) -> int:
+        """Return how many keypoints are inliers, each of which may be a part of several pairs."""
+        return len(np.unique(self.keypoint_numbers[pose.is_inlier]))
 
 
 def localise(
@@ -87,6 +109,9 @@ def localise(
         matcher: For features of this model.
         leave_out: Photos that are treated as if they were not in the components.
     """
+    longer, shorter = max(query.width, query.height), min(query.width, query.height)
+    if longer >= PANORAMA_RATIO * shorter and camera_source != CameraSource.GIVEN:
+        return NoPose("The photo has the shape of a panorama, which no pinhole camera takes.")
     places = _candidates_in(components, candidates, leave_out)
     if not places:
         return NoPose("None of the best photos of the map is in the model.")
@@ -94,41 +119,104 @@ def localise(
         _match(query, group, components, matcher, leave_out)
         for group in _group_by_place(places, components)
     ]
-    groups = sorted(groups, key=lambda pairs: -len(pairs.pixels))
-    if not len(groups[0].pixels):
-        return NoPose("The photo has no matches with points of the model.")
-    focal_sigma = FOCAL_SIGMAS.get(camera_source) if camera else None
+    groups = sorted(groups, key=lambda pairs: -len(pairs.pixels))[:MAX_PLACES]
+    source = camera_source if camera else CameraSource.ESTIMATED
     tried = camera or Camera.of_focal_length(query.width, query.height, 1.0)
-    best: tuple[_Pairs, AbsolutePose] | None = None
-    for pairs in groups:
-        component = components[pairs.component]
-        found = estimate_absolute_pose(
-            pairs.pixels,
-            component.points[pairs.point_numbers],
-            tried,
-            focal_sigma,
-            component.covariances[pairs.point_numbers].astype(float),
-        )
-        if found and (best is None or found.is_inlier.sum() > best[1].is_inlier.sum()):
-            best = pairs, found
-    if best is None or best[1].is_inlier.sum() < MIN_INLIERS:
-        count = int(best[1].is_inlier.sum()) if best else 0
+    found = [
+        (pairs, pose)
+        for pairs in groups
+        if (pose := _estimate(pairs, components, tried, FOCAL_SIGMAS.get(source)))
+    ]
+    found.sort(key=lambda each: -each[0].keypoints(each[1]))
+    count = found[0][0].keypoints(found[0][1]) if found else 0
+    if count < MIN_INLIERS:
         return NoPose(
             f"{count} points of the model agree with one position of the camera, and {MIN_INLIERS} "
             "are needed."
         )
-    pairs, found = best
+    pairs, pose = found[0]
+    reason = _doubt(pairs, pose, components, found[1:])
+    if not reason and source in FOCAL_SIGMAS:
+        reason = _doubt_focal_length(pairs, pose, components, source)
+    if reason:
+        return NoPose(reason)
     return LocalPose(
         pairs.component,
-        found.rotation,
-        found.position,
-        found.covariance,
-        int(found.is_inlier.sum()),
-        len(pairs.pixels),
-        found.camera,
-        camera_source if camera else CameraSource.ESTIMATED,
-        components[pairs.component].points[pairs.point_numbers[found.is_inlier]],
-        pairs.pixels[found.is_inlier],
+        pose.rotation,
+        pose.position,
+        pose.covariance,
+        count,
+        len(np.unique(pairs.keypoint_numbers)),
+        pose.camera,
+        source,
+        components[pairs.component].points[pairs.point_numbers[pose.is_inlier]],
+        pairs.pixels[pose.is_inlier],
+    )
+
+
+def _estimate(
+    pairs: _Pairs, components: Sequence[Component], camera: Camera, focal_sigma: float | None
+) -> AbsolutePose | None:
+    component, numbers = components[pairs.component], pairs.point_numbers
+    covariances = component.covariances[numbers].astype(float)
+    points = component.points[numbers]
+    return estimate_absolute_pose(pairs.pixels, points, camera, focal_sigma, covariances)
+
+
+def _doubt(
+    pairs: _Pairs,
+    pose: AbsolutePose,
+    components: Sequence[Component],
+    others: Sequence[tuple[_Pairs, AbsolutePose]],
+) -> str | None:
+    """Return why a pose may be wrong, in words."""
+    count, component = pairs.keypoints(pose), components[pairs.component]
+    if count < MIN_INLIER_SHARE * len(np.unique(pairs.keypoint_numbers)):
+        return f"Only {count} of many matches agree with one position of the camera."
+    pixels = pairs.pixels[pose.is_inlier]
+    longer = max(pose.camera.width, pose.camera.height)
+    if np.linalg.svd(pixels - pixels.mean(axis=0), compute_uv=False)[1] < (
+        MIN_EXTENT * longer * np.sqrt(len(pixels))
+    ):
+        return "The points that agree are in a small part or on a line of the photo."
+    low, high = PLAUSIBLE_FOCAL_LENGTHS
+    if not low <= pose.camera.focal_length <= high:
+        return (
+            f"The points agree with a focal length of {pose.camera.focal_length:.2f} longer sides "
+            "only, which hardly a camera has."
+        )
+    seen = component.points[pairs.point_numbers[pose.is_inlier]] - pose.position
+    depth = float(np.median(seen @ pose.rotation[2]))
+    if np.sqrt(np.trace(pose.covariance[:3, :3])) > MAX_SIGMA_OF_DEPTH * depth:
+        return "The points that agree leave the position of the camera open."
+    centres = component.centres()[list(pairs.photos)]
+    if np.linalg.norm(centres - pose.position, axis=1).min() > MAX_DEPTHS * depth:
+        return "The position of the camera would be far away from the photos that it matches."
+    for other, rival in others:
+        is_same = (
+            other.component == pairs.component
+            and np.linalg.norm(rival.position - pose.position) < SAME_POSE_DEPTHS * depth
+            and rival.rotation[2] @ pose.rotation[2] > SAME_POSE_COSINE
+        )
+        if not is_same and other.keypoints(rival) >= max(MIN_INLIERS, RIVAL_SHARE * count):
+            return "Two places of the model explain the photo about equally well."
+    return None
+
+
+def _doubt_focal_length(
+    pairs: _Pairs, pose: AbsolutePose, components: Sequence[Component], source: CameraSource
+) -> str | None:
+    """Return why the focal length that was used contradicts the matches, in words."""
+    free = _estimate(pairs, components, pose.camera, None)
+    if free is None or pairs.keypoints(free) <= pairs.keypoints(pose):
+        return None
+    used = pose.camera.focal_length
+    off = abs(np.log(free.camera.focal_length / used))
+    if off <= MAX_FOCAL_SIGMAS * np.hypot(free.focal_sigma, FOCAL_SIGMAS[source]):
+        return None
+    return (
+        f"The focal length ({source}) is {used:.2f} longer sides, but the matches agree with "
+        f"{free.camera.focal_length:.2f}."
     )
 
 
@@ -191,6 +279,7 @@ def _match(
     return _Pairs(
         number,
         tuple(row for _, row, _ in group),
+        pairs[:, 0].astype(np.int32),
         query.pixels()[pairs[:, 0]],
         pairs[:, 1].astype(np.int32),
     )

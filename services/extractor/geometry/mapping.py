@@ -7,7 +7,7 @@ for photos of any size, and stored at the photos' sizes.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -25,6 +25,11 @@ from shared.matching.features import WORKING_SIDE
 from shared.matching.verification import MAX_EPIPOLAR_ERROR_PIXELS
 
 MIN_MODEL_PHOTOS = 3
+MIN_MODEL_POINTS = 60
+MIN_FOCAL_PHOTOS = 10
+"""of a component that tells the focal length of its camera"""
+ENOUGH_SHARE = 0.9
+"""of the photos in the largest component: a second run would add little"""
 UNKNOWN_FOCAL_LENGTH = 0.9
 """in longer sides, from which the reconstruction starts: 26 mm of film"""
 MIN_INFORMATION = 1e-6
@@ -166,8 +171,6 @@ def _map(
             model = pycolmap.Reconstruction(str(path))
             scales = {number: _working_scale(camera) for number, camera in model.cameras.items()}
             models.append(_resized(model, scales))
-        database = Path(scratch) / "database.db"
-        _write_database(pycolmap, photos, matches, database, models)
         tried = 0
 
         def count() -> None:
@@ -175,30 +178,69 @@ def _map(
             tried += 1
             report(tried)
 
-        def run(name: str, start: Path | str, names: list[str]) -> list[Any]:
-            options = pycolmap.IncrementalPipelineOptions()
-            options.min_model_size = MIN_MODEL_PHOTOS
-            options.extract_colors = False
-            options.random_seed = RANDOM_SEED
-            options.image_names = names
-            out = Path(scratch) / name
-            out.mkdir()
-            found = pycolmap.incremental_mapping(
-                str(database), scratch, str(out), options, str(start), next_image_callback=count
-            )
-            return list(found.values())
+        def run(database: Path, start: Path | str, names: set[str], is_known: bool) -> list[Any]:
+            options = _pipeline_options(pycolmap, is_known)
+            options.image_names = sorted(names)
+            with TemporaryDirectory(dir=scratch) as out:
+                found = pycolmap.incremental_mapping(
+                    str(database), out, out, options, str(start), next_image_callback=count
+                )
+            return sorted(found.values(), key=lambda model: -model.num_reg_images())
 
+        database = Path(scratch) / "first.db"
+        _write_database(pycolmap, photos, matches, database, models)
         rest = {str(photo.id) for photo in photos} - {name for m in models for name in _names(m)}
         found: list[Any] = []
         for number, model in enumerate(models):
             start = Path(scratch) / f"start-{number}"
             start.mkdir()
             model.write(str(start))
-            found += run(f"extended-{number}", start, sorted(rest | set(_names(model))))[:1]
+            extended = run(database, start, rest | set(_names(model)), True)
+            found.append(extended[0] if extended else model)
             rest -= set(_names(found[-1]))
         if len(rest) >= MIN_MODEL_PHOTOS:
-            found += run("anew", "", sorted(rest))
+            anew = run(database, "", rest, bool(models))
+            largest = anew[0].num_reg_images() if anew else 0
+            if not models and MIN_FOCAL_PHOTOS <= largest < ENOUGH_SHARE * len(rest):
+                # Small components can't tell their focal length: they get that of the largest one.
+                database = Path(scratch) / "second.db"
+                _write_database(pycolmap, _with_cameras_of(anew[0], photos), matches, database, [])
+                again = run(database, "", rest, True)
+                if sum(m.num_reg_images() for m in again) > sum(m.num_reg_images() for m in anew):
+                    anew = again
+            found += anew
         return _write_models(photos, found, folder)
+
+
+def _pipeline_options(pycolmap: Any, is_focal_length_known: bool) -> Any:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_model_size = MIN_MODEL_PHOTOS
+    options.extract_colors = False
+    options.random_seed = RANDOM_SEED
+    # It needs half of the time of walks through corridors, and registers hardly a photo.
+    options.structure_less_registration_fallback = False
+    if is_focal_length_known:
+        # Fewer parameters need fewer matches than COLMAP's defaults, which are made for SIFT.
+        options.ba_refine_focal_length = False
+        options.mapper.abs_pose_refine_focal_length = False
+        options.mapper.init_min_num_inliers = 60
+        options.mapper.init_min_tri_angle = 8
+        options.mapper.abs_pose_min_num_inliers = 20
+    return options
+
+
+def _with_cameras_of(model: Any, photos: Sequence[PhotoToMap]) -> list[PhotoToMap]:
+    """Return the photos with the focal lengths of a model's cameras."""
+    by_name = {str(photo.id): photo for photo in photos}
+    focals = {}
+    for number in model.reg_image_ids():
+        image = model.image(number)
+        key = by_name[image.name].camera_key
+        focals[key] = float(image.camera.mean_focal_length()) / WORKING_SIDE
+    return [
+        replace(photo, focal_length=focals.get(photo.camera_key, photo.focal_length))
+        for photo in photos
+    ]
 
 
 def _triangulate(
@@ -349,7 +391,8 @@ def _write_models(photos: Sequence[PhotoToMap], models: Sequence[Any], folder: P
     by_name = {str(photo.id): photo for photo in photos}
     errors = []
     ordered = sorted(models, key=lambda model: -model.num_reg_images())
-    for number, model in enumerate(m for m in ordered if m.num_points3D()):
+    kept = [model for model in ordered if model.num_points3D() >= MIN_MODEL_POINTS]
+    for number, model in enumerate(kept):
         errors.append(float(model.compute_mean_reprojection_error()))
         scales = {}
         for image in model.images.values():
