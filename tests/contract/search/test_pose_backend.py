@@ -160,7 +160,7 @@ def test_component_without_alignment_or_calibration_has_a_pose_without_coordinat
         ("damaged component", "The reconstruction can't be read"),
         ("other photos", "belongs to the reconstruction"),
         ("only itself", "belongs to the reconstruction"),
-        ("other place", "no matches with points of the model"),
+        ("other place", "points of the model"),
     ],
 )
 def test_query_without_a_pose_gets_the_reason(

@@ -193,7 +193,7 @@ def test_component_without_coordinates_gives_a_pose_in_its_frame_and_the_reason(
         ("no reconstruction", "no reconstruction yet"),
         ("features of another model", "is of local features of xfeat@0123456789ab"),
         ("matching off", "`matching` is off"),
-        ("other place", "no matches with points"),
+        ("other place", "points of the model"),
         ("no texture", "too little texture"),
         ("search fails", "No search worker answers."),
         ("filtered", "most similar photos belongs to the reconstruction"),
