@@ -151,9 +151,7 @@ def _to_message(pose: LocalPose, number: int, component: PoseComponent) -> Compo
             "quaternion": quaternion_of(pose.rotation).tolist(),
             "inliers": pose.inliers,
             "matches": pose.matches,
-            "width": pose.camera.width,
-            "height": pose.camera.height,
-            "focal_pixels": pose.camera.focal_pixels,
+            **asdict(pose.camera),
             "camera_source": pose.camera_source,
             "seen": [
                 {"query": pixel, "point": point}
