@@ -36,13 +36,11 @@ from shared.catalog.models import (
     list_registered_models,
     remove_model,
 )
-from shared.errors import Misconfigured, PlacewiseError, TooLarge, invalid_field_error
-from shared.extractor_config.configs import get_extractor_config
+from shared.errors import PlacewiseError, TooLarge, invalid_field_error
 from shared.extractor_config.names import (
     MAX_NAME_CHARACTERS,
     MODEL_NAME_PATTERN,
     MODEL_NAME_RULE,
-    ONNX_PREFIX,
 )
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
@@ -222,6 +220,7 @@ def _parse_model_fields(fields: dict[str, str]) -> dict[str, str | None]:
     if not re.fullmatch(MODEL_NAME_PATTERN, name):
         raise invalid_field_error("name", MODEL_NAME_RULE)
     for field, max_characters in (
+        ("options", MAX_NAME_CHARACTERS),
         ("licence", MAX_LICENCE_CHARACTERS),
         ("note", MAX_NOTE_CHARACTERS),
     ):
@@ -230,15 +229,9 @@ def _parse_model_fields(fields: dict[str, str]) -> dict[str, str | None]:
             raise invalid_field_error(
                 field, f"must have at most {max_characters} characters, without NUL"
             )
-    options = fields.get("options") or None
-    if options is not None:
-        try:  # the format does not matter: all have the same options
-            get_extractor_config(f"{ONNX_PREFIX}{name}:{options}", allow_test_extractors=False)
-        except Misconfigured as error:
-            raise invalid_field_error("options", error.detail) from None
     return {
         "name": name,
-        "options": options,
+        "options": fields.get("options") or None,
         "licence": fields.get("licence") or None,
         "note": fields.get("note") or None,
     }

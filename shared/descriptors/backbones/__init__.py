@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch.nn.functional import normalize
 
-from shared.descriptors.weight_files import OnProgress
+from shared.descriptors.weight_files import OnProgress, first_error_line
 from shared.extractor_config.configs import MAX_WIDTH, ExtractorConfig
 from shared.extractor_config.names import NetworkInput
 from shared.imaging.preprocessing import Preprocessing
@@ -112,6 +112,38 @@ class Backbone(ABC):
         `features` returns the patches row by row. (1, 1) for one feature of the whole photo.
         """
         return 1, 1
+
+
+class NetworkBackbone(Backbone):
+    """Backbone of a network that computes one descriptor of a photo, (B, D)."""
+
+    network: Callable[[torch.Tensor], Any]
+    """Of a batch as `expected` says; of a tuple of results, the first is the descriptor."""
+    expected: NetworkInput
+
+    @torch.inference_mode()
+    def features(self, pixels: torch.Tensor) -> torch.Tensor:
+        features = normalise_features(self._forward(pixels))
+        return features.unsqueeze(1) if features.ndim == 2 else features
+
+    def _forward(self, pixels: torch.Tensor) -> Any:
+        out = self.network(to_network_input(pixels.to(self.device), self.expected))
+        return out[0] if isinstance(out, tuple | list) and out else out
+
+    @torch.inference_mode()
+    def probe(self, height: int, width: int) -> tuple[Any, Any]:
+        """Return what `find_descriptor_fault` checks: for two images of noise, and for the first.
+
+        Raises ValueError with a reason if the network raises anything.
+        """
+        photos = probe_photos(height, width)
+        try:
+            return self._forward(photos), self._forward(photos[:1])
+        except Exception as error:  # networks of others may raise anything
+            raise ValueError(
+                f"with 2 photos of {height} x {width} pixels it fails with "
+                f"{type(error).__name__}: {first_error_line(error)}"
+            ) from error
 
 
 def backbone_class(config: ExtractorConfig) -> type[Backbone]:

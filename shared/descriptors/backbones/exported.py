@@ -15,6 +15,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import io
+import os
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -23,13 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from shared.descriptors.backbones import (
-    Backbone,
-    find_descriptor_fault,
-    normalise_features,
-    probe_photos,
-    to_network_input,
-)
+from shared.descriptors.backbones import NetworkBackbone, find_descriptor_fault
 from shared.descriptors.weight_files import first_error_line
 from shared.errors import Misconfigured, Unprocessable
 from shared.extractor_config.configs import ExtractorConfig
@@ -39,10 +34,9 @@ from shared.imaging.preprocessing import get_preprocessing
 ONNX_MEMORY_BYTES = 4_000_000_000  # of all ONNX networks of a process, with their weights
 
 Network = Callable[[torch.Tensor], Any]
-"""Computes the outputs for a batch in the network's own layout and dtype."""
 
 
-class ExportedBackbone(Backbone):
+class ExportedBackbone(NetworkBackbone):
     """Backbone that runs a TorchScript or ONNX file of others."""
 
     def __init__(
@@ -70,8 +64,10 @@ class ExportedBackbone(Backbone):
         assert config.model is not None
         assert config.input is not None
         self._config = config
-        self._input = config.input
-        self.name = ":".join(filter(None, [config.model.extractor, ",".join(self._input.options)]))
+        self.expected = config.input
+        self.name = ":".join(
+            filter(None, [config.model.extractor, ",".join(self.expected.options)])
+        )
         self.fingerprint = hashlib.sha256(data).hexdigest()
         self.layer = "descriptor" if config.aggregator == "none" else "patches"
         self.licence = licence
@@ -79,14 +75,17 @@ class ExportedBackbone(Backbone):
         self.device = device
         try:
             if config.model.prefix == ONNX_PREFIX:
-                self._network = _open_onnx(data)
+                self.network = _open_onnx(data)
             else:
-                self._network = _open_torchscript(data, device)
+                self.network = _open_torchscript(data, device)
         except Misconfigured:
             raise
         except Exception as error:  # ONNX Runtime's own types have no other base
-            raise self._unusable_error(f"it can't be read ({first_error_line(error)})") from error
-        self.width = self._probe()
+            raise self._unusable_error(
+                f"it can't be read ({first_error_line(error)}). Weights of an ONNX file that are "
+                "in another file are never read: export it with external_data=False"
+            ) from error
+        self.width = self._check()
 
     @classmethod
     def load(
@@ -104,44 +103,33 @@ class ExportedBackbone(Backbone):
             ) from error
         return cls(config, data, device, card={"source": path.name})
 
-    @torch.inference_mode()
-    def features(self, pixels: torch.Tensor) -> torch.Tensor:
-        features = normalise_features(self._forward(pixels))
-        return features.unsqueeze(1) if features.ndim == 2 else features
-
     def _forward(self, pixels: torch.Tensor) -> Any:
         """Return (B, D), or (B, patches, D) of a map; anything else as it comes."""
-        out = self._network(to_network_input(pixels.to(self.device), self._input))
-        out = out[0] if isinstance(out, tuple | list) and out else out
-        if not isinstance(out, torch.Tensor) or self.layer == "descriptor":
+        out = super()._forward(pixels)
+        if not isinstance(out, torch.Tensor):
             return out
-        if out.ndim == 4:
-            out = out if self._input.layout == "nhwc" else out.permute(0, 2, 3, 1)
-            out = out.flatten(1, 2)
+        if self.layer == "patches" and out.ndim == 4:
+            is_last = self.expected.layout == "nhwc"
+            out = (out if is_last else out.permute(0, 2, 3, 1)).flatten(1, 2)
         return out.to(self.device)
 
-    @torch.inference_mode()
-    def _probe(self) -> int:
+    def _check(self) -> int:
         """Return the width of a feature; raise `model_unusable` if the output can't be used."""
-        height, width = get_preprocessing(self._input.preprocessing).typical_size
-        photos = probe_photos(height, width)
+        size = get_preprocessing(self.expected.preprocessing).typical_size
         try:
-            both, alone = self._forward(photos), self._forward(photos[:1])
-        except Exception as error:  # a network of others may raise anything
-            raise self._unusable_error(
-                f"with 2 photos of {height} x {width} pixels it fails with "
-                f"{type(error).__name__}: {first_error_line(error)}"
-            ) from error
+            both, alone = self.probe(*size)
+        except ValueError as error:
+            raise self._unusable_error(str(error)) from error
         fault = None
         if self.layer == "patches":
-            if not isinstance(both, torch.Tensor) or both.ndim != 3 or len(both) != 2:
-                came = tuple(both.shape) if isinstance(both, torch.Tensor) else type(both).__name__
+            shape = tuple(getattr(both, "shape", ()))
+            if len(shape) == 3 and shape[0] == 2:
+                both, alone = both.float().mean(dim=1), alone.float().mean(dim=1)
+            else:
                 fault = (
-                    f"for 2 photos it returns {came}; aggregator={self._config.aggregator} needs "
+                    f"for 2 photos it returns the shape {shape}, and this aggregator needs "
                     "patches: (2, D, h, w), (2, h, w, D) with input.layout=nhwc, or (2, patches, D)"
                 )
-            else:
-                both, alone = both.float().mean(dim=1), alone.float().mean(dim=1)
         fault = fault or find_descriptor_fault(both, alone)
         if fault is None and torch.equal(both[0], both[1]):
             fault = "its descriptors of two different photos are equal"
@@ -190,16 +178,15 @@ def _open_onnx(data: bytes) -> Network:
             "ONNX files need the package onnxruntime, which is not installed. Install the extra "
             "`onnx` where the extractor runs: uv pip install '.[onnx]' in the repository.",
         ) from None
-    if _names_other_files(memoryview(data)):
-        raise ValueError(
-            "its weights are in another file. Save it as one file: "
-            "torch.onnx.export(..., external_data=False), or onnx.save(onnx.load(FILE), OUT)"
-        )
     _limit_onnx_memory()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     options.log_severity_level = 4  # errors are raised, too
     options.add_session_config_entry("session.use_env_allocators", "1")
+    # By default, files that it names are read from the working directory. Nothing is in this one.
+    options.add_session_config_entry(
+        "session.model_external_initializers_file_folder_path", os.devnull
+    )
     session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     inputs = session.get_inputs()
     if len(inputs) != 1:
@@ -226,56 +213,3 @@ def _limit_onnx_memory() -> None:
     )
     limits = onnxruntime.OrtArenaCfg({"max_mem": ONNX_MEMORY_BYTES, "arena_extend_strategy": 1})
     onnxruntime.create_and_register_allocator(memory, limits)
-
-
-# Numbers of the fields of onnx.proto3 that hold messages with tensors, by message. ONNX Runtime
-# follows the names of files in them, relative to the working directory, and the package `onnx`,
-# which could read them, would be needed for nothing else.
-ONNX_MESSAGES = {
-    "model": {7: "graph", 20: "training", 25: "function"},
-    "graph": {1: "node", 5: "tensor", 15: "sparse"},
-    "training": {1: "graph", 2: "graph"},
-    "function": {7: "node", 11: "attribute"},
-    "node": {5: "attribute"},
-    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse", 23: "sparse"},
-    "sparse": {1: "tensor", 2: "tensor"},
-    "tensor": {13: "external"},
-}
-FIXED_BYTES = {1: 8, 5: 4}  # by wire type
-
-
-def _names_other_files(data: memoryview, message: str = "model", depth: int = 0) -> bool:
-    """Whether an ONNX message has tensors in other files; raises ValueError if it is damaged."""
-    position = 0
-    while position < len(data):
-        tag, position = _read_varint(data, position)
-        field, wire_type = tag >> 3, tag & 7
-        if wire_type == 0:
-            _, position = _read_varint(data, position)
-            continue
-        size = FIXED_BYTES.get(wire_type)
-        if wire_type == 2:
-            size, position = _read_varint(data, position)
-        if size is None or position + size > len(data) or depth > 100:
-            raise ValueError("it is not an ONNX file, or damaged")
-        inner = ONNX_MESSAGES[message].get(field) if wire_type == 2 else None
-        if inner == "external" or (
-            inner and _names_other_files(data[position : position + size], inner, depth + 1)
-        ):
-            return True
-        position += size
-    return False
-
-
-def _read_varint(data: memoryview, position: int) -> tuple[int, int]:
-    """Return a number of 7 bits a byte, and the position after it."""
-    value = 0
-    for shift in range(0, 70, 7):
-        if position >= len(data):
-            break
-        byte = data[position]
-        position += 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value, position
-    raise ValueError("it is not an ONNX file, or damaged")

@@ -28,12 +28,9 @@ import httpx2
 import torch
 
 from shared.descriptors.backbones import (
-    Backbone,
+    NetworkBackbone,
     StoredWeights,
     find_descriptor_fault,
-    normalise_features,
-    probe_photos,
-    to_network_input,
 )
 from shared.descriptors.weight_files import (
     OnProgress,
@@ -266,7 +263,7 @@ def _exception_chain(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
-class TorchHubBackbone(Backbone):
+class TorchHubBackbone(NetworkBackbone):
     """Backbone that runs a torch.hub entry; one feature per photo."""
 
     licence = "unknown"
@@ -291,15 +288,16 @@ class TorchHubBackbone(Backbone):
         self.licence = _find_licence(folder)
         self.device = device
         module = _load_module(hub, folder, on_progress)
-        self._module = module.eval().requires_grad_(False).to(device)
-        self.fingerprint, size_bytes = module_fingerprint(self._module)
+        self.network = module = module.eval().requires_grad_(False).to(device)
+        self.expected = hub.input
+        self.fingerprint, size_bytes = module_fingerprint(module)
         self.card: dict[str, Any] = {
             "source": hub.source,
             "entry": hub.entry,
             "arguments": dict(hub.arguments),
             "size_bytes": size_bytes,
         }
-        self.width = self._probe()
+        self.width = self._check()
 
     def own_spec(self) -> dict[str, Any]:
         return {"code_fingerprint": self.code_fingerprint}
@@ -332,31 +330,16 @@ class TorchHubBackbone(Backbone):
         assert config.hub is not None
         return cls(config.hub, torch.device("cpu"), on_progress=on_progress)
 
-    @torch.inference_mode()
-    def features(self, pixels: torch.Tensor) -> torch.Tensor:
-        return normalise_features(self._forward(pixels)).unsqueeze(1)
-
-    def _forward(self, pixels: torch.Tensor) -> Any:
-        out = self._module(to_network_input(pixels.to(self.device), self._hub.input))
-        return out[0] if isinstance(out, tuple | list) and out else out
-
-    @torch.inference_mode()
-    def _probe(self) -> int:
+    def _check(self) -> int:
         """Return the descriptor's dimension; raise `torchhub_unusable` for invalid descriptors."""
-        hub = self._hub
-        height, width = get_preprocessing(hub.input.preprocessing).typical_size
-        photos = probe_photos(height, width)
+        size = get_preprocessing(self._hub.input.preprocessing).typical_size
         try:
-            both, alone = self._forward(photos), self._forward(photos[:1])
-        except Exception as error:  # third-party networks may raise anything
-            raise _torchhub_unusable_error(
-                hub,
-                f"with 2 photos of {height} x {width} pixels it fails with "
-                f"{type(error).__name__}: {first_error_line(error)}",
-            ) from error
+            both, alone = self.probe(*size)
+        except ValueError as error:
+            raise _torchhub_unusable_error(self._hub, str(error)) from error
         fault = find_descriptor_fault(both, alone)
         if fault is not None:
-            raise _torchhub_unusable_error(hub, fault)
+            raise _torchhub_unusable_error(self._hub, fault)
         return int(both.shape[1])
 
 

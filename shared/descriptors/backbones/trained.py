@@ -12,22 +12,16 @@ from typing import Any
 
 import torch
 
-from shared.descriptors.backbones import (
-    Backbone,
-    find_descriptor_fault,
-    normalise_features,
-    normalise_pixels,
-    probe_photos,
-)
+from shared.descriptors.backbones import NetworkBackbone, find_descriptor_fault
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
 from shared.descriptors.vpr_models.model import VprModel
 from shared.errors import Unprocessable
 from shared.extractor_config.configs import ExtractorConfig
-from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
+from shared.extractor_config.names import DEFAULT_INPUT, IMAGENET_MEAN, IMAGENET_STD
 from shared.imaging.preprocessing import get_preprocessing, squeeze_name
 
 
-class TrainedBackbone(Backbone):
+class TrainedBackbone(NetworkBackbone):
     """Backbone that runs a `VprModel`; one feature per photo."""
 
     def __init__(
@@ -55,6 +49,7 @@ class TrainedBackbone(Backbone):
         self.layer = model.config.agg_arch
         self.width = model.dimension
         self._model = model.eval().requires_grad_(False).to(device)
+        self.network, self.expected = self._model, DEFAULT_INPUT
         self.image_size = model.config.image_size
         """Height and width in pixels."""
         self.preprocessing = get_preprocessing(
@@ -83,16 +78,6 @@ class TrainedBackbone(Backbone):
         backbone.check()
         return backbone
 
-    @torch.inference_mode()
-    def features(self, pixels: torch.Tensor) -> torch.Tensor:
-        return normalise_features(self._forward(pixels)).unsqueeze(1)
-
-    def _forward(self, pixels: torch.Tensor) -> torch.Tensor:
-        batch = normalise_pixels(pixels.to(self.device), IMAGENET_MEAN, IMAGENET_STD)
-        rows: torch.Tensor = self._model(batch)
-        return rows
-
-    @torch.inference_mode()
     def check(self) -> None:
         """Check the weights, and the descriptors of two images of noise.
 
@@ -101,9 +86,8 @@ class TrainedBackbone(Backbone):
         for name, tensor in self._model.state_dict().items():
             if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
                 raise _model_unusable_error(f"its weights {name} contain NaN or infinite numbers")
-        photos = probe_photos(*self.image_size)
-        both = self._forward(photos)
-        fault = find_descriptor_fault(both, self._forward(photos[:1]))
+        both, alone = self.probe(*self.image_size)
+        fault = find_descriptor_fault(both, alone)
         if fault is None and torch.equal(both[0], both[1]):
             fault = "its descriptors of two different photos are equal"
         if fault is not None:

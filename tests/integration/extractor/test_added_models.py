@@ -516,11 +516,10 @@ def test_a_file_that_is_no_network_for_photos_fails_and_leaves_nothing(
     assert allowing.json("GET", "/models")["models"] == []
 
 
-def test_options_of_an_exported_network_are_validated_before_the_file_is_read(
-    service: Service,
-) -> None:
-    field_refused(send_exported(service, b"any", "net.onnx", options="input.size=9"), "options")
-    assert keys(service, CHECKPOINTS) == []
+def test_options_that_no_network_has_fail_with_those_that_exist(service: Service) -> None:
+    sent = send_exported(service, b"any", "net.onnx", options="input.size=9")
+    assert "input.size, input.mean" in failed(service, sent, "bad_extractor_option")
+    field_refused(send_exported(service, b"any", "net.onnx", options="x" * 201), "options")
     field_refused(switch(service, extractor=f"onnx:/etc/passwd:{SIZE}"), "extractor")
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import re
+import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import pytest
 import torch
 from onnx import TensorProto, helper
@@ -213,8 +214,8 @@ def test_an_onnx_file_that_names_other_files_is_refused_with_how_to_save_it_as_o
     assert list(tmp_path.glob("net.onnx.data"))
     assert "external_data=False" in refusal(f"onnx:x:{SIZE}", separate)
     # Hidden in the branch of a condition.
-    (tmp_path / "secret").write_bytes(np.ones(3, np.float32).tobytes())
-    hidden = helper.make_tensor("w", TensorProto.FLOAT, [3], [1, 1, 1])
+    (tmp_path / "secret").write_bytes(np.ones(1, np.float32).tobytes())
+    hidden = helper.make_tensor("w", TensorProto.FLOAT, [1], [1])
     del hidden.float_data[:]
     hidden.data_location = TensorProto.EXTERNAL
     hidden.external_data.add(key="location", value="secret")
@@ -222,11 +223,16 @@ def test_an_onnx_file_that_names_other_files_is_refused_with_how_to_save_it_as_o
         [helper.make_node("Constant", [], ["b"], value=hidden)],
         "branch",
         [],
-        [helper.make_tensor_value_info("b", TensorProto.FLOAT, [3])],
+        [helper.make_tensor_value_info("b", TensorProto.FLOAT, [1])],
     )
     node = helper.make_node("If", ["c"], ["y"], then_branch=branch, else_branch=branch)
     condition = helper.make_tensor("c", TensorProto.BOOL, [], [True])
-    assert "another file" in refusal(f"onnx:x:{SIZE}", operators([node], [condition]))
+    assert "can't be read" in refusal(f"onnx:x:{SIZE}", operators([node], [condition]))
+    # As weights, relative and absolute: the file exists, and is not read.
+    add = helper.make_node("Add", ["x", "w"], ["y"])
+    for location in ("secret", str(tmp_path / "secret"), "../" + tmp_path.name + "/secret"):
+        hidden.external_data[0].value = location
+        assert "can't be read" in refusal(f"onnx:x:{SIZE}", operators([add], [hidden]))
 
 
 def test_an_onnx_file_that_asks_for_more_memory_than_it_may_have_is_refused() -> None:
@@ -277,4 +283,12 @@ def test_a_map_without_a_vocabulary_pools_the_patches_of_the_same_network() -> N
     assert pooled.name == f"onnx:town:aggregator=gem,{SIZE}"
     assert pooled.backbone_key == config.backbone_key
     assert config.backbone_key != config_of(f"onnx:town:{SIZE}").backbone_key
-    assert onnx.__version__  # the tests' exports need it; services do not import it
+
+
+def test_onnx_without_its_package_says_what_to_install(
+    tiny_onnx: Callable[[bool], bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(Misconfigured, match=re.escape(".[onnx]")) as caught:
+        backbone(f"onnx:x:{SIZE}", tiny_onnx(False))
+    assert caught.value.code == "onnx_missing"
