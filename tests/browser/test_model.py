@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 from playwright.sync_api import Route, expect
 
 from tests.browser.conftest import MAP, Town, Visitor
+from tests.support.exported import SIDE, onnx_of, tiny_network
 
 
 def test_a_vocabulary_is_fitted_with_a_bar_and_compared_with_the_one_before(
@@ -175,3 +177,29 @@ def test_a_new_map_is_created_and_selected(visitor: Visitor, town: Town) -> None
     expect(page.get_by_role("heading", name="This map has no photos yet")).to_be_visible()
     expect(page.locator("#map-choice")).to_have_value("old-town")
     assert "old-town" in [one["name"] for one in town.server.client.get("/api/v1/maps").json()]
+
+
+def test_added_models_are_listed_and_can_be_switched_to(
+    visitor: Visitor, town: Town, tmp_path: Path
+) -> None:
+    file = onnx_of(tiny_network(), tmp_path)
+    options = f"input.size={SIDE}x{SIDE}"
+    form = {"name": "tiny", "licence": "MIT", "options": options}
+    started = town.server.client.post(
+        "/api/v1/models", data=form, files={"file": ("net.onnx", file)}
+    )
+    finished = town.server.finished(started.json()["job_id"])
+    assert finished["state"] == "succeeded", finished
+    page = visitor.visit("model")
+    row = page.get_by_role("group", name="Added models").locator("tbody tr")
+    expect(row).to_contain_text(f"onnx:tiny:{options}")
+    expect(row).to_contain_text("MIT")
+    refused = {"code": "model_change_running", "detail": "Another change is running."}
+    page.route(
+        "**/api/v1/generations*",
+        lambda route: route.fulfill(status=409, json=refused),
+    )
+    with page.expect_request("**/api/v1/generations*") as sent:
+        row.get_by_role("button", name="Switch to it").click()
+    assert sent.value.post_data_json == {"extractor": f"onnx:tiny:{options}"}
+    assert town.server.client.delete("/api/v1/models/tiny").is_success

@@ -18,10 +18,11 @@ const STANDING = {
 
 export async function showModel(view, { signal }) {
   const path = `/maps/${encodeURIComponent(currentMap())}`;
-  const [map, generations, vocabularies, { evaluations }, { jobs }] = await Promise.all([
+  const [map, generations, vocabularies, { evaluations }, { jobs }, { models }] = await Promise.all([
     get(path, { signal }), get("/generations", { signal }), get("/vocabularies", { signal }),
     get("/evaluations", { query: { limit: 50 }, signal }),
     get("/jobs", { query: { kind: Object.keys(CHANGES), state: ["queued", "running"] }, signal }),
+    get("/models", { signal }).catch(() => ({ models: [] })), // a key of single maps may not list them
   ]);
   const again = () => showModel(view, { signal });
   const work = h("div", { class: "work" });
@@ -45,7 +46,8 @@ export async function showModel(view, { signal }) {
       work),
     comparison(evaluations, generations, vocabularies, () => measure(follow)),
     generationsTable(generations, vocabularies),
-    vocabulariesTable(vocabularies, generations, follow));
+    vocabulariesTable(vocabularies, generations, follow),
+    modelsTable(models, map, follow));
   for (const job of jobs.slice(0, 1)) follow(job, CHANGES[job.kind]);
 }
 
@@ -173,6 +175,18 @@ function vocabulariesTable(vocabularies, generations, follow) {
         h("td", { class: "row end" },
           button("Download", () => download(one)),
           active?.vocabulary_id === one.vocabulary_id && !active.pca_from ? h("span", { class: "chip own" }, "in use") : button("Switch to it", async () => follow(await post("/generations", { json: { vocabulary_id: one.vocabulary_id } }), CHANGES.switch)))))))));
+}
+
+/** Models that were added to the server; a map switches to one by its extractor. */
+function modelsTable(models, map, follow) {
+  if (!models.length) return null;
+  const change = (extractor) => async () => follow(await post("/generations", { json: { extractor } }), "Switching the extractor");
+  return h("section", { class: "card" }, h("h2", {}, "Added models"),
+    h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Added models" }, h("table", {},
+      h("thead", {}, h("tr", {}, ["Extractor", "Licence", "Maps"].map((name) => h("th", { scope: "col" }, name)), h("th", { scope: "col" }, h("span", { class: "visually-hidden" }, "What can be done")))),
+      h("tbody", {}, models.map((one) => h("tr", {},
+        h("td", {}, one.extractor), h("td", {}, one.licence), h("td", {}, one.maps.join(", ")),
+        h("td", { class: "row end" }, map.extractor === one.extractor ? h("span", { class: "chip own" }, "in use") : button("Switch to it", change(one.extractor)))))))));
 }
 
 async function download(vocabulary) {
