@@ -13,16 +13,7 @@ from typer.core import TyperGroup
 
 from services.cli.environment import require_packages
 
-BENCHMARKS = (
-    "search",
-    "pipeline",
-    "query-latency",
-    "chaos",
-    "estimates",
-    "matches",
-    "extract",
-    "pose",
-)
+BENCHMARKS = ("search", "pipeline", "query-latency", "chaos", "estimates", "matches", "extract")
 
 
 class _BenchmarkGroup(TyperGroup):

@@ -39,6 +39,7 @@ PANELS = {
         "models": "services.cli.descriptors.models:app",
         "describe": "services.cli.descriptors.describe:describe",
         "evaluate": "services.cli.evaluate:evaluate",
+        "compare": "services.cli.compare:compare",
     },
     "Services": {
         "serve": "services.cli.operations.servers:serve",
@@ -55,7 +56,8 @@ PANELS = {
     },
 }
 # The lab's commands exist where `lab` stands beside `services`: in a clone of the repository, but
-# in no image. Its `evaluate` replaces that of the service.
+# in no image. Its `evaluate` and `compare` replace those of the
+# service.
 LAB_PANEL = "Descriptors and accuracy"
 LAB_COMMANDS = {
     "evaluate": "lab.cli.evaluation.commands:evaluate",

@@ -79,18 +79,14 @@ class PoseEstimator:
                 "reconstruction. It does not cover this place, or photos were added since: add "
                 "them with `placewise reconstruct`."
             )
-        try:
-            pose = localise(
-                query[1],
-                candidates,
-                list(components.values()),
-                *_camera(request, query[1], components.values()),
-                MutualNearest.of_model(request.features_model),
-                frozenset(request.leave_out),
-            )
-        except np.linalg.LinAlgError as error:  # the search itself has an answer
-            log.warning("a pose can't be computed: %s", error)
-            return PoseResponse(reason="The points of the model that match determine no position.")
+        pose = localise(
+            query[1],
+            candidates,
+            list(components.values()),
+            *_camera(request, query[1], components.values()),
+            MutualNearest.of_model(request.features_model),
+            frozenset(request.leave_out),
+        )
         if isinstance(pose, NoPose):
             return PoseResponse(reason=pose.reason)
         number = list(components)[pose.component]
@@ -151,7 +147,9 @@ def _to_message(pose: LocalPose, number: int, component: PoseComponent) -> Compo
             "quaternion": quaternion_of(pose.rotation).tolist(),
             "inliers": pose.inliers,
             "matches": pose.matches,
-            **asdict(pose.camera),
+            "width": pose.camera.width,
+            "height": pose.camera.height,
+            "focal_pixels": pose.camera.focal_pixels,
             "camera_source": pose.camera_source,
             "seen": [
                 {"query": pixel, "point": point}

@@ -194,12 +194,20 @@ def _answered(places: PlaceEvaluation, share: str) -> float:
     return answered
 
 
+def _draw(photos: Sequence[Photo], size: int, seed: int) -> list[Photo]:
+    """Draw at most `size` photos, reproducible by `seed`, in their order."""
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(len(photos), size=min(size, len(photos)), replace=False)
+    return [photos[index] for index in sorted(chosen.tolist())]
+
+
 class MapEvaluation:
     """Evaluates one generation of a map.
 
     Photos within `radius_m` metres show the same place; `scheme` has the levels of an estimate, and
     `matching` tells whether matches are evaluated. `on_query` is called after every search and
-    every matched photo; an exception that it raises ends the evaluation.
+    every matched photo; an exception that it raises ends the evaluation. At most `max_photos` of
+    the map's photos, and of its labelled queries, are drawn; by default all.
     """
 
     def __init__(
@@ -211,6 +219,7 @@ class MapEvaluation:
         scheme: LevelScheme,
         matching: Matching,
         on_query: Callable[[], None],
+        max_photos: int | None = None,
     ) -> None:
         self.radius_m = radius_m
         self.scheme = scheme
@@ -218,8 +227,9 @@ class MapEvaluation:
         with catalog.read() as session:
             ids = (generation.map_id, generation.id)
             database = read_geotagged_photos(session, *ids, PhotoRole.DATABASE)
-            self.database = GeotaggedPhotos(database)
-            self.queries = read_geotagged_photos(session, *ids, PhotoRole.QUERY)
+            self.database = GeotaggedPhotos(_draw(database, max_photos or len(database), seed=0))
+            queries = read_geotagged_photos(session, *ids, PhotoRole.QUERY)
+            self.queries = _draw(queries, max_photos or len(queries), seed=0)
             version = session.get_one(Map, generation.map_id).version
             has_features = find_features_model(session, generation.id) is not None
         self.matching = matching if has_features else Matching.OFF
@@ -229,11 +239,7 @@ class MapEvaluation:
 
     def draw_sample(self, size: int, seed: int) -> list[GeotaggedPhoto]:
         """Draw at most `size` database photos as leave-one-out queries, reproducible by `seed`."""
-        photos = self.database.photos
-        chosen = np.random.default_rng(seed).choice(
-            len(photos), size=min(size, len(photos)), replace=False
-        )
-        return [photos[index] for index in sorted(chosen.tolist())]
+        return _draw(self.database.photos, size, seed)
 
     def evaluate(
         self, sample: Sequence[GeotaggedPhoto], weights: tuple[float, ...] = ()

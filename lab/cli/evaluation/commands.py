@@ -15,6 +15,12 @@ from typing import Annotated, Any
 
 import typer
 
+from services.cli.compare import (
+    DEFAULT_PHOTOS,
+    ExtractorOption,
+    PhotosOption,
+    WeightsOption,
+)
 from services.cli.environment import require_packages
 from services.cli.evaluate import SampleOption, SeedOption, WordWeightsOption, evaluate_map
 from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption
@@ -323,22 +329,22 @@ def _parse_image_size(text: str, checkpoint: Path | None) -> str | tuple[int, in
 
 def compare(
     data: Annotated[
-        Path,
+        Path | None,
         typer.Argument(
             metavar="DIR",
             exists=True,
             file_okay=False,
-            help="Data set with a database and queries.",
+            help="Data set with a database and queries. Default: a map, see --map.",
         ),
-    ],
+    ] = None,
     extractors: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="Comma-separated extractor names with options as in EXTRACTOR, or checkpoints "
-            "(.ckpt, .pth). `+fit` fits the VLAD vocabulary on the database photos; `+pca512` "
-            "reduces descriptors to 512 dimensions by PCA whitening.",
+            help="DIR: comma-separated extractor names with options as in EXTRACTOR, or "
+            "checkpoints (.ckpt, .pth). `+fit` fits the VLAD vocabulary on the database photos; "
+            "`+pca512` reduces descriptors to 512 dimensions by PCA whitening.",
         ),
-    ],
+    ] = None,
     set_name: Annotated[
         str | None, typer.Option("--set", help="Set of DIR. Required if there are several.")
     ] = None,
@@ -348,15 +354,26 @@ def compare(
         Path | None, typer.Option(help="Output folder for comparison.json and report.html.")
     ] = None,
     faiss_gpu: FaissGpuOption = False,
+    extractor: ExtractorOption = None,
+    photos: PhotosOption = DEFAULT_PHOTOS,
+    weights: WeightsOption = False,
+    map_name: MapOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare recall, speed and size of several extractors on one data set.
+    """Compare recall, speed and size of several extractors on one data set, or on a map.
 
-    Descriptors are cached in PLACEWISE_HOME/descriptors: a repeated run describes only what is
-    missing.
+    Descriptors of a data set are cached in PLACEWISE_HOME/descriptors: a repeated run describes
+    only what is missing. On a map of this machine, those whose weights are here are compared.
     """
     # Must be set before torch is loaded below; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    if data is None:
+        from services.cli.descriptors.compare_on_map import compare_on_map
+
+        compare_on_map(map_name, extractor, photos, weights, as_json)
+        return
+    if extractors is None:
+        raise InvalidRequest("bad_extractors", "A data set requires --extractors.")
     require_packages()
     from lab.cli.evaluation.compare_extractors import compare_extractors
 

@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 import torch
@@ -93,24 +93,37 @@ def _added_backbone(
 
 
 DecodeOutcome = DecodedPhoto | PlacewiseError
+Photo = TypeVar("Photo")
+ReadPhoto = Callable[[Photo], bytes | PlacewiseError]
+"""Returns the bytes of a photo, or why they can't be read."""
+
+
+def read_file(photo: Any) -> bytes | PlacewiseError:
+    """Read a photo by its path."""
+    try:
+        with open_file(photo) as file:
+            return file.read()
+    except InvalidRequest as error:
+        return InvalidRequest("photo_unreadable", error.detail)
 
 
 def _decode_batches(
-    photos: Sequence[Path],
+    photos: Sequence[Photo],
     preprocessing: Preprocessing,
     settings: Settings,
     seconds: defaultdict[str, float],
-) -> Iterator[list[tuple[Path, DecodeOutcome]]]:
+    read_photo: ReadPhoto[Photo],
+) -> Iterator[list[tuple[Photo, DecodeOutcome]]]:
     """Decode photos in batches, the next one in the background; adds to `seconds["decode"]`."""
     decoders = DecoderPool(settings)
 
-    def read(begin: int) -> list[tuple[Path, DecodeOutcome]]:
+    def read(begin: int) -> list[tuple[Photo, DecodeOutcome]]:
         started = time.perf_counter()
         chunk = photos[begin : begin + settings.batch_photos]
-        contents = [_read_photo(photo) for photo in chunk]
+        contents = [read_photo(photo) for photo in chunk]
         readable = [content for content in contents if isinstance(content, bytes)]
         outcomes = iter(decoders.decode(readable, preprocessing))
-        batch: list[tuple[Path, DecodeOutcome]] = [
+        batch: list[tuple[Photo, DecodeOutcome]] = [
             (photo, next(outcomes) if isinstance(content, bytes) else content)
             for photo, content in zip(chunk, contents, strict=True)
         ]
@@ -127,7 +140,7 @@ def _decode_batches(
 
 
 def _split_outcomes(
-    batch: Sequence[tuple[Path, DecodeOutcome]], refused: list[tuple[Path, PlacewiseError]]
+    batch: Sequence[tuple[Photo, DecodeOutcome]], refused: list[tuple[Photo, PlacewiseError]]
 ) -> list[Pixels]:
     """Return the (height, width, 3) pixels of a batch; its other photos are added to `refused`."""
     pixels = []
@@ -140,25 +153,27 @@ def _split_outcomes(
 
 
 def decode_pixels(
-    photos: Sequence[Path],
+    photos: Sequence[Photo],
     preprocessing: Preprocessing,
     settings: Settings,
-    refused: list[tuple[Path, PlacewiseError]],
+    refused: list[tuple[Photo, PlacewiseError]],
+    read_photo: ReadPhoto[Photo] = read_file,
 ) -> Iterator[list[Pixels]]:
     """Decode photos to batches of pixels as `_split_outcomes` does, in the order of the photos."""
-    for batch in _decode_batches(photos, preprocessing, settings, defaultdict(float)):
+    for batch in _decode_batches(photos, preprocessing, settings, defaultdict(float), read_photo):
         if pixels := _split_outcomes(batch, refused):
             yield pixels
 
 
 def describe_photos(
-    photos: Sequence[Path],
+    photos: Sequence[Photo],
     extractor: Extractor,
     centres: ClusterCentres | None,
     settings: Settings,
-    refused: list[tuple[Path, PlacewiseError]],
+    refused: list[tuple[Photo, PlacewiseError]],
     seconds: defaultdict[str, float],
     projection: PcaProjection | None = None,
+    read_photo: ReadPhoto[Photo] = read_file,
 ) -> Iterator[Rows]:
     """Describe photos batch by batch.
 
@@ -170,7 +185,8 @@ def describe_photos(
         (b, D) float32 rows in the order of the photos.
     """
     clock = inference_clock(extractor.backbone.device)
-    for batch in _decode_batches(photos, extractor.preprocessing, settings, seconds):
+    batches = _decode_batches(photos, extractor.preprocessing, settings, seconds, read_photo)
+    for batch in batches:
         pixels = _split_outcomes(batch, refused)
         if refused or not pixels:
             continue
@@ -186,14 +202,6 @@ def describe_photos(
                 refused.append((photo, not_finite_error()))
         if not refused:
             yield rows
-
-
-def _read_photo(photo: Path) -> bytes | PlacewiseError:
-    try:
-        with open_file(photo) as file:
-            return file.read()
-    except InvalidRequest as error:
-        return InvalidRequest("photo_unreadable", error.detail)
 
 
 HLOC_DATASET = "global_descriptor"  # hloc's name of the dataset

@@ -121,7 +121,7 @@ def inspect_weights(
     return replace(weights, available=True, **asdict(known))
 
 
-def _has_local_weights(config: ExtractorConfig, settings: Settings) -> bool:
+def has_local_weights(config: ExtractorConfig, settings: Settings) -> bool:
     """Whether the weights of an extractor are on this machine and fit it."""
     from shared.descriptors.backbones import backbone_class
 
@@ -146,7 +146,7 @@ def suggest_extractor(settings: Settings) -> str | None:
     dinov2 = [config for config in configs if config.depth is not None]
     dinov2.sort(key=lambda config: config.parameters or 0, reverse=True)
     for config in (*hub, *dinov2):
-        if _has_local_weights(config, settings):
+        if has_local_weights(config, settings):
             break
     else:
         return None

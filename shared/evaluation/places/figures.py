@@ -77,9 +77,9 @@ def answer_figures(
     ]
     return {
         "certainty": certainty,
-        "answered": _with_interval([index is not None for index in answers]),
-        "answered_at_finest_level": _with_interval([index == 0 for index in answers]),
-        "precision": _with_interval([right for _, right in known]),
+        "answered": share_with_interval([index is not None for index in answers]),
+        "answered_at_finest_level": share_with_interval([index == 0 for index in answers]),
+        "precision": share_with_interval([right for _, right in known]),
         "mean_level": _mean([index for index in answers if index is not None]),
     }
 
@@ -106,7 +106,7 @@ def reliability_figures(estimates: Sequence[HeldOutEstimate], position: int) -> 
         "reliability": [
             {
                 "stated": _mean([stated[i] for i in members]),
-                "observed": _with_interval([observed[i] for i in members]),
+                "observed": share_with_interval([observed[i] for i in members]),
             }
             for members in bins
             if len(members)
@@ -122,7 +122,7 @@ def _mean(values: Sequence[float]) -> float | None:
     return float(np.mean(values)) if len(values) else None
 
 
-def _with_interval(values: Sequence[bool]) -> dict[str, Any]:
+def share_with_interval(values: Sequence[bool]) -> dict[str, Any]:
     """Return the mean with its bootstrap interval; each query is a cluster of its own."""
     column = np.array(values, dtype=np.float64)[:, None]
     intervals = bootstrap_intervals(column, np.arange(len(column)))

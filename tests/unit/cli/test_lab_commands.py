@@ -18,11 +18,11 @@ def test_a_clone_has_the_commands_of_the_lab() -> None:
 
 def test_without_the_lab_only_its_commands_are_missing(tmp_path: Path) -> None:
     found = list_commands(tmp_path)
-    assert set(COMMANDS) - set(found) == set(LAB_COMMANDS) - {"evaluate"}
+    assert set(COMMANDS) - set(found) == set(LAB_COMMANDS) - {"evaluate", "compare"}
     assert {module.partition(".")[0] for _, module, _ in found.values()} == {"services"}
 
 
-@pytest.mark.parametrize("name", sorted(set(LAB_COMMANDS) - {"evaluate"}))
+@pytest.mark.parametrize("name", sorted(set(LAB_COMMANDS) - {"evaluate", "compare"}))
 def test_without_the_lab_its_commands_name_it(name: str, tmp_path: Path) -> None:
     app = build_app(["maps", "query"], list_commands(tmp_path))
     ended = CliRunner().invoke(app, [name, "--any", "option"])
@@ -30,11 +30,20 @@ def test_without_the_lab_its_commands_name_it(name: str, tmp_path: Path) -> None
     assert f"lab_missing: `placewise {name}` is part of the lab" in " ".join(ended.output.split())
 
 
-@pytest.mark.parametrize("option", ["--data", "--predictions"])
-def test_without_the_lab_evaluate_names_it_for_data_sets(option: str, tmp_path: Path) -> None:
-    app = build_app(["evaluate", "maps"], list_commands(tmp_path))
-    ended = CliRunner().invoke(app, ["evaluate", option, "folder", "--json"])
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["evaluate", "--data", "folder"], "--data"),
+        (["evaluate", "--predictions", "file"], "--predictions"),
+        (["compare", "folder", "--extractors", "patchnorm"], "compare DIR"),
+    ],
+)
+def test_without_the_lab_commands_name_it_for_data_sets(
+    arguments: list[str], named: str, tmp_path: Path
+) -> None:
+    app = build_app(["evaluate", "compare", "maps"], list_commands(tmp_path))
+    ended = CliRunner().invoke(app, [*arguments, "--json"])
     assert ended.exit_code == 1
     problem = json.loads(ended.output)
     assert problem["code"] == "lab_missing"
-    assert option in problem["detail"]
+    assert named in problem["detail"]
