@@ -428,19 +428,3 @@ def geopose_rotation(rotation: Floats) -> Floats:
     """
     found: Floats = rotation.T @ FLU_FROM_CAMERA.T
     return found
-
-
-def geopose_angles(rotation: Floats) -> tuple[float, float, float]:
-    """Return yaw, pitch and roll of GeoPose in degrees for `geopose_rotation`'s argument.
-
-    The inner frame is turned about z (up) by the yaw, then about the new y (left) by the pitch,
-    then about the new x (forward) by the roll: the yaw grows counterclockwise from east, and a
-    positive pitch looks down.
-    """
-    m = geopose_rotation(rotation)
-    pitch = math.asin(float(np.clip(-m[2, 0], -1, 1)))
-    if math.hypot(m[0, 0], m[1, 0]) < 1e-9:
-        yaw, roll = math.atan2(-m[0, 1], m[1, 1]), 0.0
-    else:
-        yaw, roll = math.atan2(m[1, 0], m[0, 0]), math.atan2(m[2, 1], m[2, 2])
-    return math.degrees(yaw), math.degrees(pitch), math.degrees(roll)

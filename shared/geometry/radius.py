@@ -15,7 +15,6 @@ from shared.geometry.frames import (
     EastNorthUp,
     Similarity,
     attitude_of,
-    geopose_angles,
     geopose_rotation,
 )
 from shared.geometry.localise import LocalPose
@@ -54,8 +53,6 @@ class GeoPose:
     attitude: Attitude
     quaternion: tuple[float, float, float, float]
     """w, x, y, z of `geopose_rotation`"""
-    yaw_pitch_roll: tuple[float, float, float]
-    """`geopose_angles`"""
     radius_68_m: float
     radius_95_m: float
     heading_68_degrees: float
@@ -88,7 +85,6 @@ def geo_pose(
         place.altitude_m if similarity.knows_altitude else None,
         attitude_of(rotation),
         tuple(quaternion_of(geopose_rotation(rotation)).tolist()),
-        geopose_angles(rotation),
         math.hypot(calibration.position_68 * sigma, aligned_68),
         math.hypot(calibration.position_95 * sigma, aligned_95),
         min(180.0, degrees),

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from PIL.ExifTags import IFD, Base
+from scipy.spatial.transform import Rotation
 
 from services.gateway.schemas import CameraPoseResponse
 from services.gateway.similarity.geopose import MEDIA_TYPE, geopose
@@ -28,7 +29,6 @@ from shared.geodesy import distance_m
 from shared.geometry.component import quaternion_of
 from shared.geometry.frames import (
     attitude_of,
-    geopose_angles,
     geopose_rotation,
     rotation_of_vector,
 )
@@ -290,7 +290,8 @@ def test_geopose_turns_as_the_rotation_of_the_camera_does() -> None:
             | asdict(attitude_of(rotation))
         )
         angles = geopose(pose, "ypr")["angles"]
-        assert tuple(angles.values()) == pytest.approx(geopose_angles(rotation), abs=1e-6)
+        turned = Rotation.from_euler("ZYX", list(angles.values()), degrees=True).as_matrix()
+        assert turned == pytest.approx(geopose_rotation(rotation), abs=1e-9)
         assert geopose(pose, "quaternion")["quaternion"] == dict(
             zip("wxyz", quaternion, strict=True)
         )

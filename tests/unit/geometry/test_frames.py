@@ -16,7 +16,6 @@ from shared.geometry.frames import (
     Similarity,
     align,
     attitude_of,
-    geopose_angles,
     geopose_rotation,
     rotation_of_vector,
 )
@@ -220,20 +219,6 @@ def test_attitude_is_that_of_a_camera_turned_by_hand(
     assert (found.heading - heading + 180) % 360 - 180 == pytest.approx(0, abs=1e-6)
     assert found.pitch == pytest.approx(pitch, abs=1e-6)
     assert found.roll == pytest.approx(roll, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("turned", "angles"),
-    [
-        ((90, 0, 0), (0, 0, 0)),  # the identity looks east
-        ((0, 0, 0), (90, 0, 0)),
-        ((180, 0, 0), (-90, 0, 0)),
-        ((90, 30, 0), (0, -30, 0)),
-        ((90, 0, 20), (0, 0, 20)),
-    ],
-)
-def test_angles_of_geopose(turned: tuple[float, ...], angles: tuple[float, ...]) -> None:
-    assert geopose_angles(camera(*turned)) == pytest.approx(angles, abs=1e-9)
 
 
 def test_inner_frame_of_geopose_is_forward_left_up() -> None:

@@ -48,7 +48,6 @@ def test_pose_has_coordinates_and_calibrated_radii() -> None:
     assert found.longitude == pytest.approx(7.0, abs=1e-9)
     assert found.altitude_m == pytest.approx(202, abs=0.01)
     assert found.attitude.heading == pytest.approx(45, abs=1e-3)
-    assert found.yaw_pitch_roll == pytest.approx((45, 0, 0), abs=1e-3)
     sigma_m = 2.0 * 0.1 * 2**0.5
     assert found.radius_68_m == pytest.approx(2 * sigma_m)
     assert found.radius_95_m == pytest.approx(4 * sigma_m)
