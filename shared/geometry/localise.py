@@ -16,8 +16,8 @@ from shared.geometry.component import Component
 from shared.matching.features import LocalFeatures
 from shared.matching.matchers import Matcher
 
-MIN_INLIERS = 15
-MIN_INLIER_SHARE = 0.12
+MIN_INLIERS = 30
+MIN_INLIER_SHARE = 0.25
 """of the keypoints that match a point"""
 MIN_EXTENT = 0.03
 """Standard deviation of the inliers across their line, as a share of the longer side"""

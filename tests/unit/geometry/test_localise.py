@@ -122,3 +122,110 @@ def test_photo_of_another_scene_has_no_pose(scene: ReconstructedScene) -> None:
     assert outcome.reason.endswith(".")
     outcome = localise(query, [], [scene.component], None, CameraSource.ESTIMATED, MATCHER)
     assert outcome == NoPose("None of the best photos of the map is in the model.")
+<<<<<<< HEAD
+=======
+
+
+def keep(features: LocalFeatures, chosen: np.ndarray) -> LocalFeatures:
+    return replace(
+        features,
+        positions=features.positions[chosen],
+        descriptors=features.descriptors[chosen],
+    )
+
+
+def reason(
+    query: LocalFeatures,
+    scene: ReconstructedScene,
+    component: Component | None = None,
+    camera: Camera | None = None,
+) -> str:
+    source = CameraSource.GIVEN if camera else CameraSource.ESTIMATED
+    components = [component or scene.component]
+    outcome = localise(query, scene.candidates, components, camera, source, MATCHER)
+    assert isinstance(outcome, NoPose), outcome
+    return outcome.reason
+
+
+def test_few_points_in_a_corner_or_many_wrong_matches_are_no_pose(
+    scene: ReconstructedScene,
+) -> None:
+    query, _ = scene.take(ROTATION, CENTRE)
+    assert "points of the model agree" in reason(keep(query, np.arange(25)), scene)
+    dense = ReconstructedScene(points=3000)
+    query, _ = dense.take(ROTATION, CENTRE)
+    pixels = query.pixels()
+    corner = np.flatnonzero((np.abs(pixels - (500, 350)) < 65).all(axis=1))
+    assert len(corner) > 30
+    assert "small part" in reason(keep(query, corner), dense, camera=CAMERA)
+    query, _ = dense.take(ROTATION, CENTRE, wrong=0.85)
+    assert "Only" in reason(query, dense, camera=CAMERA)
+
+
+def test_panorama_is_no_pose_unless_its_camera_is_given(scene: ReconstructedScene) -> None:
+    wide = Camera(1280, 640, 700.0)
+    query, _ = scene.take(ROTATION, CENTRE, wide)
+    assert "panorama" in reason(query, scene)
+    found(localise(query, scene.candidates, [scene.component], wide, CameraSource.GIVEN, MATCHER))
+
+
+def test_place_that_exists_twice_is_no_pose(scene: ReconstructedScene) -> None:
+    query, _ = scene.take(ROTATION, CENTRE)
+    once = scene.component
+    names = {photo: UUID(int=photo.int + 1000) for photo in once.photo_ids}
+    shift, count = np.array([0.0, 0.0, 50.0]), len(once.points)
+    turned = [once.rotation(row) @ shift for row in range(len(names))]
+    twice = replace(
+        once,
+        photo_ids=(*once.photo_ids, *names.values()),
+        rotations=np.tile(once.rotations, (2, 1)),
+        translations=np.concatenate([once.translations, once.translations - turned]),
+        camera_numbers=np.tile(once.camera_numbers, 2),
+        point_numbers=(
+            *once.point_numbers,
+            *(np.where(n >= 0, n + count, n).astype(np.int32) for n in once.point_numbers),
+        ),
+        points=np.concatenate([once.points, once.points + shift]),
+        covariances=np.tile(once.covariances, (2, 1, 1)),
+        observations=np.tile(once.observations, 2),
+    )
+    candidates = [*scene.candidates, *((names[p], f) for p, f in scene.candidates)]
+    outcome = localise(query, candidates, [twice], CAMERA, CameraSource.GIVEN, MATCHER)
+    assert outcome == NoPose("Two places of the model explain the photo about equally well.")
+    # The photos of one of the two alone know no other place.
+    found(localise(query, scene.candidates, [twice], CAMERA, CameraSource.GIVEN, MATCHER))
+
+
+def test_wrong_focal_length_is_a_reason(scene: ReconstructedScene) -> None:
+    query, _ = scene.take(ROTATION, CENTRE)
+    for factor in (0.55, 1.8):
+        wrong = replace(CAMERA, focal_pixels=factor * CAMERA.focal_pixels)
+        assert "focal length (given)" in reason(query, scene, camera=wrong)
+
+
+def test_focal_length_that_no_camera_has_is_a_reason(scene: ReconstructedScene) -> None:
+    query, _ = scene.take(ROTATION, CENTRE, Camera(640, 480, 0.325 * 640))
+    assert "hardly a camera has" in reason(query, scene)
+
+
+def test_position_that_is_open_or_far_from_the_photos_is_no_pose(
+    scene: ReconstructedScene,
+) -> None:
+    dense = ReconstructedScene(points=5000, noise_pixels=2.5)
+    query, numbers = dense.take(looking(CENTRE, CENTRE + np.array([0.0, 1.0, 0.0])), CENTRE)
+    is_wall = np.abs(dense.xyz[numbers, 1] - 11) < 0.3
+    is_middle = np.linalg.norm(query.pixels() - (320, 240), axis=1) < 100
+    wall = np.flatnonzero(is_wall & is_middle)
+    # Of a wall in front, a focal length is as good as another one from farther away.
+    assert "leave the position of the camera open" in reason(keep(query, wall), dense)
+    query, _ = scene.take(ROTATION, CENTRE)
+    elsewhere = replace(scene.component, translations=scene.component.translations + 200.0)
+    assert "far away from the photos" in reason(query, scene, elsewhere)
+
+
+def test_features_of_another_detection_are_ignored(scene: ReconstructedScene) -> None:
+    query, _ = scene.take(ROTATION, CENTRE)
+    fewer = [(p, keep(f, np.arange(len(f.positions) - 1))) for p, f in scene.candidates]
+    source = CameraSource.GIVEN
+    assert isinstance(localise(query, fewer, [scene.component], CAMERA, source, MATCHER), NoPose)
+>>>>>>> 03661f74 (Ask for 30 points and a quarter of the matches: mirrored photos and alike floors have fewer)
