@@ -13,7 +13,16 @@ from typer.core import TyperGroup
 
 from services.cli.environment import require_packages
 
-BENCHMARKS = ("search", "pipeline", "query-latency", "chaos", "estimates", "matches", "extract")
+BENCHMARKS = (
+    "search",
+    "pipeline",
+    "query-latency",
+    "chaos",
+    "estimates",
+    "matches",
+    "extract",
+    "pose",
+)
 
 
 class _BenchmarkGroup(TyperGroup):

@@ -192,6 +192,9 @@ def _print_proposals(
     if action != ProposalAction.LIST:
         print_message(f"The coordinates of {len(proposals)} photos were changed.")
         return
+    if not proposals:
+        print_message("No photo has coordinates that disagree with the reconstruction.")
+        return
     table = Table(
         "photo",
         Column("coordinates", no_wrap=True),

@@ -70,17 +70,18 @@ def prepare_features(
     Raises:
         Misconfigured: as `load_detector`, for photos that are stored.
     """
+    is_query = batch.kind == JobKind.DESCRIBE
     with context.catalog.read() as session:
         matching = session.get_one(Map, batch.jobs[0].map_id).matching
         model = find_features_model(session, target.generation.id)
         source = active_generation(session, batch.jobs[0].map_id)
-        reconstruction = current_reconstruction(session, batch.jobs[0].map_id)
-    is_query = batch.kind == JobKind.DESCRIBE
+        is_reconstructed = is_query and isinstance(
+            current_reconstruction(session, batch.jobs[0].map_id), Reconstruction
+        )
     uses_matches = target.generation.uses_matches
     if matching == Matching.OFF:
         return None
     if is_query:
-        is_reconstructed = isinstance(reconstruction, Reconstruction)
         missing = {job.id for job in batch.jobs if _is_matched(job, uses_matches, is_reconstructed)}
     elif matching == Matching.ON or uses_matches is not False:
         missing = {job.id for job in batch.jobs}

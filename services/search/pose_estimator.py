@@ -79,14 +79,18 @@ class PoseEstimator:
                 "reconstruction. It does not cover this place, or photos were added since: add "
                 "them with `placewise reconstruct`."
             )
-        pose = localise(
-            query[1],
-            candidates,
-            list(components.values()),
-            *_camera(request, query[1], components.values()),
-            MutualNearest.of_model(request.features_model),
-            frozenset(request.leave_out),
-        )
+        try:
+            pose = localise(
+                query[1],
+                candidates,
+                list(components.values()),
+                *_camera(request, query[1], components.values()),
+                MutualNearest.of_model(request.features_model),
+                frozenset(request.leave_out),
+            )
+        except np.linalg.LinAlgError as error:  # the search itself has an answer
+            log.warning("a pose can't be computed: %s", error)
+            return PoseResponse(reason="The points of the model that match determine no position.")
         if isinstance(pose, NoPose):
             return PoseResponse(reason=pose.reason)
         number = list(components)[pose.component]
@@ -147,9 +151,7 @@ def _to_message(pose: LocalPose, number: int, component: PoseComponent) -> Compo
             "quaternion": quaternion_of(pose.rotation).tolist(),
             "inliers": pose.inliers,
             "matches": pose.matches,
-            "width": pose.camera.width,
-            "height": pose.camera.height,
-            "focal_pixels": pose.camera.focal_pixels,
+            **asdict(pose.camera),
             "camera_source": pose.camera_source,
             "seen": [
                 {"query": pixel, "point": point}

@@ -14,9 +14,10 @@ import sqlalchemy as sa
 from pydantic import BaseModel, ConfigDict
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.chunks import find_features_model
+from shared.catalog.chunks import count_searchable, find_features_model
 from shared.catalog.database.base import Base, Journaled, JsonValue, UtcDateTime, db_now
-from shared.catalog.generations import active_generation
+from shared.catalog.generations import Generation, active_generation
+from shared.errors import Conflict
 from shared.ids import new_id
 from shared.storage import ObjectStore
 from shared.storage.keys import reconstruction_prefix
@@ -103,6 +104,37 @@ def gives_coordinates(session: Session, map_id: UUID) -> bool:
     return isinstance(current, Reconstruction) and any(
         each.alignment and each.calibration for each in current.list_components()
     )
+
+
+def check_reconstructable(session: Session, map_id: UUID) -> tuple[Generation, str]:
+    """Return the active generation and the model of its local features, to reconstruct its photos.
+
+    Raises:
+        Conflict: `too_few_photos`, `too_many_photos`, `no_local_features`.
+    """
+    active = active_generation(session, map_id)
+    photos = count_searchable(session, active.id) if active else 0
+    if active is None or photos < MIN_PHOTOS:
+        raise Conflict(
+            "too_few_photos",
+            f"The map has {photos} described photos, and a reconstruction needs {MIN_PHOTOS}. "
+            "Upload photos, and wait for their jobs.",
+        )
+    if photos > MAX_PHOTOS:
+        raise Conflict(
+            "too_many_photos",
+            f"The map has {photos} photos, and a reconstruction takes at most {MAX_PHOTOS}: its "
+            "time grows faster than their number. Make a map of each site or floor.",
+        )
+    model = find_features_model(session, active.id)
+    if model is None:
+        raise Conflict(
+            "no_local_features",
+            "The map's photos have no local features, of which a reconstruction is made. Switch "
+            'matching on: PATCH /api/v1/maps/{name} with {"matching": "on"}, or `placewise maps '
+            "update NAME --matching on`.",
+        )
+    return active, model
 
 
 def current_reconstruction(session: Session, map_id: UUID) -> Reconstruction | str:

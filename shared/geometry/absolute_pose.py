@@ -46,8 +46,6 @@ class AbsolutePose:
     """standard deviation of ln(focal length)"""
     is_inlier: NDArray[np.bool_]
     """(m,)"""
-    error_pixels: float
-    """root mean square of the inliers' distances, at WORKING_SIDE"""
 
 
 def estimate_absolute_pose(
@@ -167,7 +165,6 @@ class _Fit:
             covariance[:6, :6],
             float(np.sqrt(covariance[6, 6])),
             self.is_inlier,
-            float(np.sqrt(np.mean(self.errors[self.is_inlier] ** 2) * 2)),
         )
 
     def _linearise(self) -> tuple[Floats, Floats, Floats]:

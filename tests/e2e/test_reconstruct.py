@@ -94,6 +94,7 @@ def test_proposals_are_listed_accepted_and_undone(walk: ServerProcess) -> None:
     run(walk, "reconstruct", "--proposals", "accept")
     assert walk.client.get(path).json()["latitude"] == before["proposed_latitude"]
     assert result(walk, "reconstruct", "--proposals", "list") == []
+    assert "No photo has coordinates" in run(walk, "reconstruct", "--proposals", "list")
     run(walk, "reconstruct", "--proposals", "undo")
     assert walk.client.get(path).json()["latitude"] == before["latitude"]
     assert result(walk, "reconstruct", "--proposals", "list") == [before]

@@ -43,20 +43,19 @@ from services.extractor.geometry.mapping import (
 from services.extractor.geometry.matching import VerifiedMatches, match_pairs
 from services.extractor.geometry.pairs import choose_pairs
 from services.extractor.handlers import ExtractorContext
-from shared.catalog.chunks import Chunk, Descriptor, find_features_model
+from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.base import db_now
-from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.reconstructions import (
-    MAX_PHOTOS,
     MIN_PHOTOS,
     ComponentAlignment,
     ReconstructedComponent,
     Reconstruction,
+    check_reconstructable,
     current_reconstruction,
 )
-from shared.errors import Conflict, NotFound, Unprocessable
+from shared.errors import NotFound, Unprocessable
 from shared.geometry.cameras import Floats
 from shared.geometry.colmap_model import ColmapModel
 from shared.geometry.component import Component
@@ -129,7 +128,7 @@ class ReconstructionJob:
     def _begin(self) -> Reconstruction:
         """Return the reconstruction of an earlier run of the job, or a new one."""
         with self._catalog.write() as session:
-            active, model = _get_features(session, self._job.map_id)
+            active, model = check_reconstructable(session, self._job.map_id)
             begun = session.scalar(
                 select(Reconstruction).where(
                     Reconstruction.job_id == self._job.id,
@@ -168,12 +167,6 @@ class ReconstructionJob:
         )
         with self._catalog.read() as session:
             located = session.execute(chunks).all()
-        if not MIN_PHOTOS <= len(located) <= MAX_PHOTOS:
-            raise Conflict(
-                "too_few_photos" if len(located) < MIN_PHOTOS else "too_many_photos",
-                f"The map has {len(located)} photos with local features, and a reconstruction "
-                f"takes {MIN_PHOTOS} to {MAX_PHOTOS}.",
-            )
         photos = {}
         for chunk, rows in groupby(located, lambda row: row[0]):
             self._progress.check()
@@ -192,7 +185,7 @@ class ReconstructionJob:
         key = matches_key(made.id)
         if (stored := self._load_matches(key)) is not None:
             return stored
-        current = None if self._job.params["anew"] else self._current()
+        current = self._find_extendable(photos)
         known = self._load_matches(matches_key(current.id)) if current else None
         pairs = choose_pairs(
             np.array([photo.descriptor for photo in photos.values()], np.float32),
@@ -228,11 +221,24 @@ class ReconstructionJob:
         except NotFound:
             return None
 
-    def _current(self) -> Reconstruction | None:
-        """Return the reconstruction that new photos are registered into."""
+    def _find_extendable(self, photos: dict[UUID, MapPhoto]) -> Reconstruction | None:
+        """Return the reconstruction that new photos are registered into; None to make all anew.
+
+        It can't be extended after one of its photos was deleted, or has got other keypoints.
+        """
+        if self._job.params["anew"]:
+            return None
         with self._catalog.read() as session:
-            found = current_reconstruction(session, self._job.map_id)
-        return found if isinstance(found, Reconstruction) else None
+            current = current_reconstruction(session, self._job.map_id)
+        if isinstance(current, str):
+            return None
+        for stored in current.list_components():
+            component = Component.decode(self._store.get(stored.object_key))
+            for id_, numbers in zip(component.photo_ids, component.point_numbers, strict=True):
+                photo = photos.get(id_)
+                if photo is None or len(photo.features.positions) != len(numbers):
+                    return None
+        return current
 
     def _map(
         self,
@@ -253,7 +259,8 @@ class ReconstructionJob:
             folder = Path(scratch, "made")
             folder.mkdir()
             if model is None:
-                existing = self._fetch_models(Path(scratch), photos)
+                current = self._find_extendable(photos)
+                existing = self._fetch_models(Path(scratch), current) if current else []
                 found = map_photos(to_map, matches, folder, report, self._progress.check, existing)
             else:
                 source = Path(scratch, "model")
@@ -270,22 +277,14 @@ class ReconstructionJob:
             made.components = [each.model_dump(mode="json") for each in stored]
         return made, [each.component for each in found]
 
-    def _fetch_models(self, scratch: Path, photos: dict[UUID, MapPhoto]) -> list[Path]:
-        """Fetch the models that new photos are registered into; none if all are made anew.
-
-        They are if a photo of the present reconstruction was deleted or has lost its features.
-        """
-        current = None if self._job.params["anew"] else self._current()
+    def _fetch_models(self, scratch: Path, current: Reconstruction) -> list[Path]:
+        """Write the COLMAP models of a reconstruction into folders."""
         folders = []
-        for component in current.list_components() if current else ():
-            stored = Component.decode(self._store.get(component.object_key))
-            if not photos.keys() >= set(stored.photo_ids):
-                return []
+        for component in current.list_components():
             folder = scratch / f"existing-{component.number}"
             folder.mkdir()
-            for key in component.sha256:
-                if key != component.object_key:
-                    (folder / key.rpartition("/")[2]).write_bytes(self._store.get(key))
+            for key in component.sha256.keys() - {component.object_key}:
+                (folder / key.rpartition("/")[2]).write_bytes(self._store.get(key))
             folders.append(folder)
         return folders
 
@@ -422,19 +421,6 @@ class ReconstructionJob:
         if leased is None:
             raise JobInterrupted
         return leased
-
-
-def _get_features(session: Session, map_id: UUID) -> tuple[Generation, str]:
-    """Return the active generation and the model of its local features."""
-    active = active_generation(session, map_id)
-    model = find_features_model(session, active.id) if active else None
-    if active is None or model is None:
-        raise Conflict(
-            "no_local_features",
-            "The map's photos have no local features, of which a reconstruction is made. Switch "
-            "matching on: placewise maps update NAME --matching on.",
-        )
-    return active, model
 
 
 def _align(component: Component, photos: Mapping[UUID, MapPhoto]) -> Alignment | str:

@@ -390,9 +390,7 @@ def _write_models(photos: Sequence[PhotoToMap], models: Sequence[Any], folder: P
     """Write models at the photos' sizes with their components, the one with most photos first."""
     by_name = {str(photo.id): photo for photo in photos}
     errors = []
-    ordered = sorted(models, key=lambda model: -model.num_reg_images())
-    kept = [model for model in ordered if model.num_points3D() >= MIN_MODEL_POINTS]
-    for number, model in enumerate(kept):
+    for number, model in enumerate(_without_shared_photos(models)):
         errors.append(float(model.compute_mean_reprojection_error()))
         scales = {}
         for image in model.images.values():
@@ -412,6 +410,24 @@ def _write_models(photos: Sequence[PhotoToMap], models: Sequence[Any], folder: P
             "No photos could be reconstructed together: too few matches agree with each other.",
         )
     return errors
+
+
+def _without_shared_photos(models: Sequence[Any]) -> list[Any]:
+    """Return the models, most photos first, each without the photos of those before it.
+
+    pycolmap lets the models of one run overlap. A photo in two frames would have two poses.
+    """
+    kept: list[Any] = []
+    names: set[str] = set()
+    for model in sorted(models, key=lambda model: -model.num_reg_images()):
+        for number in list(model.reg_image_ids()):
+            if model.image(number).name in names:
+                model.deregister_frame(model.image(number).frame_id)
+        is_enough = model.num_reg_images() >= MIN_MODEL_PHOTOS
+        if is_enough and model.num_points3D() >= MIN_MODEL_POINTS:
+            kept.append(model)
+            names.update(_names(model))
+    return kept
 
 
 def _component_of(

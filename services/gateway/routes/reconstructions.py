@@ -20,17 +20,14 @@ from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import GatewayContext, GatewayDep, MapQuery, ReconstructionId
 from services.gateway.idempotency import IdempotentDep, IdempotentRequest
 from services.gateway.schemas import JobAcceptedResponse, RequestModel, ResponseModel
-from shared.catalog.chunks import count_searchable, find_features_model
 from shared.catalog.database.base import get_in_map
-from shared.catalog.generations import active_generation
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import get_map, lock_map
 from shared.catalog.photos import Photo
 from shared.catalog.reconstructions import (
-    MAX_PHOTOS,
-    MIN_PHOTOS,
     ReconstructedComponent,
     Reconstruction,
+    check_reconstructable,
     current_reconstruction,
 )
 from shared.errors import Conflict, NotFound
@@ -185,7 +182,8 @@ def _queue(
 ) -> JobAcceptedResponse:
     with gateway.catalog.write() as session:
         map_id = lock_map(session, get_map(session, map_name).id).id
-        _check_reconstructable(session, map_id)
+        _check_not_running(session, map_id)
+        check_reconstructable(session, map_id)
         job = Job(
             id=new_id(),
             map_id=map_id,
@@ -198,7 +196,7 @@ def _queue(
     return accepted
 
 
-def _check_reconstructable(session: Session, map_id: UUID) -> None:
+def _check_not_running(session: Session, map_id: UUID) -> None:
     running = session.scalar(
         select(Job.id).where(
             Job.map_id == map_id,
@@ -212,27 +210,6 @@ def _check_reconstructable(session: Session, map_id: UUID) -> None:
             f"The map is being reconstructed already (job {running}). Wait for it, or cancel it: "
             f"POST /api/v1/jobs/{running}/cancel.",
             job_id=str(running),
-        )
-    active = active_generation(session, map_id)
-    photos = count_searchable(session, active.id) if active else 0
-    if active is None or photos < MIN_PHOTOS:
-        raise Conflict(
-            "too_few_photos",
-            f"The map has {photos} described photos, and a reconstruction needs {MIN_PHOTOS}. "
-            "Upload photos, and wait for their jobs.",
-        )
-    if photos > MAX_PHOTOS:
-        raise Conflict(
-            "too_many_photos",
-            f"The map has {photos} photos, and a reconstruction takes at most {MAX_PHOTOS}: its "
-            "time grows faster than their number. Make a map of each site or floor.",
-        )
-    if find_features_model(session, active.id) is None:
-        raise Conflict(
-            "no_local_features",
-            "The map's photos have no local features, of which a reconstruction is made. Switch "
-            'matching on: PATCH /api/v1/maps/{name} with {"matching": "on"}, or `placewise maps '
-            "update NAME --matching on`.",
         )
 
 

@@ -92,22 +92,11 @@ def _to_message(component: ReconstructedComponent) -> PoseComponent:
 
 
 def _to_response(pose: ComponentPose, component: ReconstructedComponent) -> CameraPoseResponse:
-    on_earth = dict.fromkeys(GeographicPose.model_fields)
-    if pose.geographic:
-        on_earth = pose.geographic.model_dump()
-    return CameraPoseResponse(
-        **on_earth,
-        reason=None if pose.geographic else component.not_aligned or NOT_CALIBRATED,
+    found = pose.geographic
+    return CameraPoseResponse.of_row(
+        pose,
+        **(found.model_dump() if found else dict.fromkeys(GeographicPose.model_fields)),
+        reason=None if found else component.not_aligned or NOT_CALIBRATED,
         component=component.number,
-        position=pose.position,
-        quaternion=pose.quaternion,
-        inliers=pose.inliers,
-        matches=pose.matches,
-        camera=PoseCameraResponse(
-            focal_pixels=pose.focal_pixels,
-            width=pose.width,
-            height=pose.height,
-            source=pose.camera_source,
-        ),
-        seen=list(pose.seen),
+        camera=PoseCameraResponse.of_row(pose, source=pose.camera_source),
     )

@@ -172,8 +172,8 @@ class RankingParams(BaseModel):
         None,
         ge=0.1,
         le=100,
-        description="Focal length of the query's camera, as a multiple of the photo's longer side "
-        "(that for 35 mm film, divided by 36). Default: that of the EXIF, or else it is estimated.",
+        description="Focal length of the query's camera in pixels, divided by the photo's longer "
+        "side. Default: that of the EXIF, or else it is estimated.",
     )
     geopose: Literal["quaternion", "ypr"] = Field(
         "quaternion",

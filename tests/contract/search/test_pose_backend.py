@@ -189,6 +189,14 @@ def test_query_without_a_pose_gets_the_reason(
     assert reason in response.reason
 
 
+def test_points_that_determine_no_pose_are_a_reason_and_no_error(
+    backend: SearchBackend, store: FolderStore, scene: ReconstructedScene
+) -> None:
+    scene.component.covariances[:] = -1e9 * np.eye(3)
+    response = backend.estimate_pose(pose_request(store, scene))
+    assert response.reason == "The points of the model that match determine no position."
+
+
 def test_readable_components_are_used_when_others_are_lost(
     backend: SearchBackend, store: FolderStore, scene: ReconstructedScene
 ) -> None:

@@ -78,7 +78,7 @@ def test_map_that_can_not_be_reconstructed_is_refused_with_what_to_do(service: S
 def test_map_with_more_photos_than_a_reconstruction_takes_is_refused(
     service: Service, ids: list[UUID], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("services.gateway.routes.reconstructions.MAX_PHOTOS", 2)
+    monkeypatch.setattr("shared.catalog.reconstructions.MAX_PHOTOS", 2)
     refused = problem(service("POST", "/reconstructions"), 409, "too_many_photos")
     assert "takes at most 2" in refused["detail"]
     assert MAX_PHOTOS >= 1000

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from uuid import UUID
 
 import numpy as np
 import pytest
 
 from shared.geometry.cameras import Camera, CameraSource
+from shared.geometry.component import Component
 from shared.geometry.localise import LocalPose, NoPose, localise
+from shared.matching.features import LocalFeatures
 from shared.matching.matchers import MutualNearest
 from tests.support.reconstructed_scene import CAMERA, ReconstructedScene, looking
 
@@ -122,8 +125,6 @@ def test_photo_of_another_scene_has_no_pose(scene: ReconstructedScene) -> None:
     assert outcome.reason.endswith(".")
     outcome = localise(query, [], [scene.component], None, CameraSource.ESTIMATED, MATCHER)
     assert outcome == NoPose("None of the best photos of the map is in the model.")
-<<<<<<< HEAD
-=======
 
 
 def keep(features: LocalFeatures, chosen: np.ndarray) -> LocalFeatures:
@@ -228,4 +229,3 @@ def test_features_of_another_detection_are_ignored(scene: ReconstructedScene) ->
     fewer = [(p, keep(f, np.arange(len(f.positions) - 1))) for p, f in scene.candidates]
     source = CameraSource.GIVEN
     assert isinstance(localise(query, fewer, [scene.component], CAMERA, source, MATCHER), NoPose)
->>>>>>> 03661f74 (Ask for 30 points and a quarter of the matches: mirrored photos and alike floors have fewer)

@@ -208,6 +208,7 @@ def _gateway_requests(
     yield request("POST", f"/jobs/{jobs[JobState.QUEUED]}/cancel")
     yield request("POST", f"/jobs/{jobs[JobState.FAILED]}/retry")
     yield request("POST", f"/similarity/{photo.id}", params={"top_k": 10})
+    yield request("POST", f"/similarity/{photo.id}", params={"pose": "true"})
     yield request("PATCH", one, json={"place": "elsewhere"})
     yield request("DELETE", f"/uploads/{ids[60]}")
     buffer = io.BytesIO()

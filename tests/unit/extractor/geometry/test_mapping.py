@@ -100,6 +100,16 @@ def test_points_are_within_their_covariance(
     assert 1.0 < np.median(squares) < 5.0  # 2.4 of chi-squared in three dimensions
 
 
+def test_photo_is_in_one_component_only(
+    scene: ReconstructedScene, mapped: MappedComponent, tmp_path: Path
+) -> None:
+    overlapping = [mapped.folder, mapped.folder]
+    found = only(
+        map_photos(*everything(scene), tmp_path, lambda _: None, lambda: None, overlapping)
+    )
+    assert set(found.component.photo_ids) == set(scene.features)
+
+
 def test_photo_is_localised_in_a_reconstruction(
     scene: ReconstructedScene, mapped: MappedComponent
 ) -> None:
