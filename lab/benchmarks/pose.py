@@ -298,12 +298,12 @@ def measure_city(report: Report, count: int, progress: Progress) -> list[tuple[s
         rows.append((f"{factor} times the focal length", bad, other))
     bad = 0
     for n in by_day[:other]:
-        foreign = features[int(rng.choice(members))]
+        foreign = features[int(rng.choice(outside))]
         pose = mapped.localise(_covered(features[n], foreign))
         if isinstance(pose, LocalPose):
             error, _, r95, _ = _judge(pose, alignment, calibration, truth[n])
             bad += error > WRONG_RADII * r95
-    rows.append(("two fifths show another place of the map", bad, other))
+    rows.append(("two fifths show what is not in the map", bad, other))
     return rows
 
 
