@@ -16,6 +16,15 @@ from tests.support.server import CommandLine, ServerProcess
 
 SETTINGS = {"auto_evaluate_photos": 0}
 MAPS = "/api/v1/maps"
+POSE = {"camera": 0, "rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}
+BODIES: dict[str, Any] = {
+    "positions": {"photos": []},
+    "import": {
+        "cameras": [{"model": "SIMPLE_PINHOLE", "width": 4, "height": 3, "params": [4, 2, 1.5]}],
+        "photos": [{"name": name, **POSE} for name in "abc"],
+    },
+}
+"""What calls with JSON need, by the end of their paths."""
 fresh = itertools.count(7000)
 names = (f"town-{number}" for number in itertools.count())
 
@@ -101,7 +110,7 @@ def test_every_call_says_how_to_make_the_map_that_is_missing(server: ServerProce
                 if path.endswith("/models"):
                     body["data"] = {"name": "mine"}
             elif "application/json" in content:
-                body = {"json": {"photos": []} if path.endswith("/positions") else {}}
+                body = {"json": BODIES.get(path.rpartition("/")[2], {})}
             here = re.sub(r"{\w+}", lambda _: str(uuid4()), path)
             answer = server.client.request(method, here, params={"map": "nowhere"}, **body)
             detail = problem(answer, 404, "map_not_found")["detail"]

@@ -61,7 +61,7 @@ def test_every_call_is_described_once(server: ServerProcess) -> None:
     form = calls[f"POST {API}/upload"]["requestBody"]["content"]["multipart/form-data"]["schema"]
     assert form["required"] == ["file"]
     assert set(form["properties"]) == {
-        *("file", "latitude", "longitude", "heading"),
+        *("file", "latitude", "longitude", "altitude", "heading"),
         *("captured_at", "place", "tags", "metadata", "role", "relative_path"),
     }
 
