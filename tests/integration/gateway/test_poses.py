@@ -25,6 +25,7 @@ from shared.catalog.photos import Photo
 from shared.catalog.reconstructions import ReconstructedComponent
 from shared.catalog.tracks import TrackFrame
 from shared.errors import NotFound, Unavailable
+from shared.evaluation.places.probability import PlaceModel, shipped_prior
 from shared.geodesy import distance_m
 from shared.geometry.component import quaternion_of
 from shared.geometry.frames import (
@@ -196,6 +197,7 @@ def test_component_without_coordinates_gives_a_pose_in_its_frame_and_the_reason(
         ("other place", "points of the model"),
         ("no texture", "too little texture"),
         ("search fails", "No search worker answers."),
+        ("floor that the map lacks", "probably no photo of this place (probability 0.99)"),
         ("filtered", "most similar photos belongs to the reconstruction"),
     ],
 )
@@ -226,6 +228,14 @@ def test_query_without_a_pose_is_answered_with_the_reason(
             raise Unavailable("search_unavailable", "No search worker answers.")
 
         monkeypatch.setattr(service.search, "estimate_pose", fail)
+    elif case == "floor that the map lacks":
+        others = (0.0,) * (len(shipped_prior().level) - 1)
+        model = PlaceModel(
+            source="own_photos", own_photos=20, levels=((-5, *others),), not_in_map=(9, *others)
+        )
+        with service.catalog.write() as session:
+            session.query(Photo).update({"place": "hall"})
+            session.query(Generation).one().calibration = model.model_dump(mode="json")
     elif case == "filtered":
         params = {"ids": ids[-1]}
     answer = ask(service, features, **params)
