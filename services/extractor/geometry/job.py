@@ -45,7 +45,7 @@ from services.extractor.geometry.pairs import choose_pairs
 from services.extractor.handlers import ExtractorContext
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.base import db_now
-from shared.catalog.maps import Map
+from shared.catalog.maps import Map, decide_label_paths
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.reconstructions import (
     MIN_PHOTOS,
@@ -69,6 +69,7 @@ from shared.jobs.runner import JobInterrupted
 from shared.jobs.transitions import succeed_job
 from shared.matching.features import LocalFeatures
 from shared.matching.matchers import MutualNearest
+from shared.place_paths import label_levels
 from shared.storage.chunks import features_key, read_chunk
 from shared.storage.feature_files import read_feature_index, read_feature_rows
 from shared.storage.keys import component_key, matches_key, reconstruction_prefix
@@ -192,6 +193,7 @@ class ReconstructionJob:
             _seconds(photos.values()),
             _numbers(photo.row.latitude for photo in photos.values()),
             _numbers(photo.row.longitude for photo in photos.values()),
+            self._read_sections(photos),
         )
         ids = list(photos)
         if known is not None:
@@ -214,6 +216,13 @@ class ReconstructionJob:
         self._store.put(key, matches.encode())
         self._end_step()
         return matches
+
+    def _read_sections(self, photos: dict[UUID, MapPhoto]) -> list[str | None]:
+        """Return the level above the place label of each photo; None where there is none."""
+        with self._catalog.read() as session:
+            are_paths = decide_label_paths(session, session.get_one(Map, self._job.map_id))
+        levels = (label_levels(photo.row.place, are_paths) for photo in photos.values())
+        return [found[1] if len(found) > 1 else None for found in levels]
 
     def _load_matches(self, key: str) -> VerifiedMatches | None:
         try:

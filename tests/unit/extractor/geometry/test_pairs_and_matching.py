@@ -57,6 +57,21 @@ def test_neighbours_in_time_and_place_are_pairs() -> None:
     assert (40, 43) not in found  # farther than MAX_DISTANCE_M
 
 
+def test_photos_of_two_floors_are_no_pair_unless_both_have_coordinates() -> None:
+    seconds = np.linspace(0, 2.0 * COUNT, COUNT)
+    rows = np.zeros((COUNT, 8), np.float32)
+    floors = [("tower/1", "tower/2", None)[number % 3] for number in range(COUNT)]
+
+    def across(latitudes: np.ndarray, longitudes: np.ndarray) -> set[tuple[str, str]]:
+        found = choose_pairs(rows, seconds, latitudes, longitudes, floors).tolist()
+        assert any(floors[one] is None != floors[other] for one, other in found)
+        named = [{floors[one], floors[other]} - {None} for one, other in found]
+        return {tuple(sorted(names)) for names in named if len(names) == 2}
+
+    assert not across(NOWHERE, NOWHERE)
+    assert across(np.full(COUNT, 45.0), np.full(COUNT, 7.0))
+
+
 def test_map_without_photos_has_no_pairs() -> None:
     empty = np.empty(0)
     assert choose_pairs(np.empty((0, 8), np.float32), empty, empty, empty).shape == (0, 2)
