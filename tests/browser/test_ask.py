@@ -374,12 +374,14 @@ def test_a_match_is_shown_beside_the_photo_with_lines_between_their_points(
     left, right = (dialog.locator(".frame img").nth(side).bounding_box() for side in (0, 1))
     assert left
     assert right
-    for line in lines.all():
-        ends = line.evaluate(
-            """(line) => { const box = line.ownerSVGElement.getBoundingClientRect();
-            return ["1", "2"].map((end) => ["x", "y"].map((axis) =>
-              line[axis + end].baseVal.value + box[axis])); }"""
-        )
+    # At once, because the lines are drawn anew when a photo is loaded.
+    drawn = lines.evaluate_all(
+        """(lines) => lines.map((line) => {
+        const box = line.ownerSVGElement.getBoundingClientRect();
+        return ["1", "2"].map((end) => ["x", "y"].map((axis) =>
+          line[axis + end].baseVal.value + box[axis])); })"""
+    )
+    for ends in drawn:
         for (x, y), photo in zip(ends, (left, right), strict=True):
             assert photo["x"] - 1 <= x <= photo["x"] + photo["width"] + 1
             assert photo["y"] - 1 <= y <= photo["y"] + photo["height"] + 1

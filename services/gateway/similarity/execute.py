@@ -216,10 +216,10 @@ def run_similarity_search(
     rankings = _rank_photos(search, search_params)
     matches = _match_best_photos(search, rankings, search_params)
     estimate, probabilities = _estimate(search, rankings, matches, weights, search_params)
-    is_labelled = bool(estimate.levels) and estimate.levels[0].radius_m is None
     # Along coordinates, queries of another season look as if they were not in the map.
-    not_in_map = estimate.not_in_map_probability if is_labelled else None
-    pose = find_pose(gateway, query, rankings.found.hits, search_params, not_in_map)
+    is_labelled = bool(estimate.levels) and estimate.levels[0].radius_m is None
+    is_missing = is_labelled and estimate.in_map is False
+    pose = find_pose(gateway, query, rankings.found.hits, search_params, is_missing=is_missing)
     similar = rankings.similar
     hits = matches.rerank(similar.hits, search_params.rerank or 0)[: search_params.top_k]
     response = SimilarityResponse.of_row(

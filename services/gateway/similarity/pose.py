@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MAX_NOT_IN_MAP = 0.5
-"""Floors and halls that are built alike agree in their points, too: only the estimate of the place
-tells that the map lacks one"""
 NOT_CALIBRATED = (
     "How far off poses are could not be measured in this component: too few of its photos find "
     "their pose without themselves. Add photos, and run `placewise reconstruct`."
@@ -42,20 +39,22 @@ def find_pose(
     query: SimilarityQuery,
     hits: Sequence[SearchHit],
     search_params: SearchParams,
-    not_in_map: float | None = None,
+    *,
+    is_missing: bool = False,
 ) -> CameraPoseResponse | str | None:
     """Return the pose of a query, or why it has none, as a sentence; None if it was not requested.
 
     Args:
         hits: The most similar photos, best first.
-        not_in_map: Probability that the map has no photo of the place; None if it says nothing.
+        is_missing: Whether the estimate says that the place is not in the map. Floors that are
+            built alike agree in their points, so only the estimate tells that the map lacks one.
     """
     if not search_params.pose:
         return None
-    if not_in_map is not None and not_in_map > MAX_NOT_IN_MAP:
+    if is_missing:
         return (
-            f"The map has probably no photo of this place (probability {not_in_map:.2f}). Add "
-            "some, and run `placewise reconstruct`."
+            "The place is probably not in this map, and places that are built alike agree in their "
+            "points. Add photos of it, and run `placewise reconstruct`."
         )
     if query.map.matching == Matching.OFF:
         return (

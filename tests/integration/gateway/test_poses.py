@@ -197,7 +197,7 @@ def test_component_without_coordinates_gives_a_pose_in_its_frame_and_the_reason(
         ("other place", "points of the model"),
         ("no texture", "too little texture"),
         ("search fails", "No search worker answers."),
-        ("floor that the map lacks", "probably no photo of this place (probability 0.99)"),
+        ("floor that the map lacks", "probably not in this map"),
         ("filtered", "most similar photos belongs to the reconstruction"),
     ],
 )
@@ -231,7 +231,11 @@ def test_query_without_a_pose_is_answered_with_the_reason(
     elif case == "floor that the map lacks":
         others = (0.0,) * (len(shipped_prior().level) - 1)
         model = PlaceModel(
-            source="own_photos", own_photos=20, levels=((-5, *others),), not_in_map=(9, *others)
+            source="own_photos",
+            own_photos=20,
+            levels=((-5, *others),),
+            not_in_map=(9, *others),
+            in_map_limit=0.9,
         )
         with service.catalog.write() as session:
             session.query(Photo).update({"place": "hall"})
