@@ -9,12 +9,12 @@ from __future__ import annotations
 import logging
 import os
 import threading
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache, partial
-from typing import TypeVar
+from functools import cache
+from operator import attrgetter
+from typing import Any
 
-from cachetools import LRUCache
+from cachetools import LRUCache, cachedmethod
 
 from shared.errors import NotFound
 from shared.matching.features import MIN_SIDE, LocalFeatures
@@ -37,8 +37,6 @@ CACHED_FEATURE_BYTES = 64_000_000  # 900 photos of 1,000 keypoints of XFeat
 CACHED_INDEX_BYTES = 16_000_000  # of files with 2 million photos
 MAX_THREADS = 4
 
-Key = TypeVar("Key")
-Value = TypeVar("Value")
 ModelFeatures = tuple[str, LocalFeatures]
 """`Detector.model`, and the features that it computed"""
 
@@ -49,10 +47,10 @@ class PhotoMatcher:
     def __init__(self, store: ObjectStore) -> None:
         self._store = store
         self._lock = threading.Lock()
-        self._features: LRUCache[FeatureReference, ModelFeatures] = LRUCache(
+        self._features: LRUCache[Any, ModelFeatures] = LRUCache(
             CACHED_FEATURE_BYTES, getsizeof=lambda found: 68 + found[1].descriptors.nbytes
         )
-        self._indexes: LRUCache[str, FeatureIndex] = LRUCache(
+        self._indexes: LRUCache[Any, FeatureIndex] = LRUCache(
             CACHED_INDEX_BYTES, getsizeof=lambda index: index.offsets.nbytes
         )
 
@@ -97,31 +95,28 @@ class PhotoMatcher:
         try:
             if reference.object_key.startswith(QUERIES):  # expires with its object
                 return self._read_stored(reference)
-            return self._cached(self._features, reference, self._read_stored)
+            return self._read_cached(reference)
         except NotFound:
             return None
         except ValueError as error:
             log.warning("the local features in %s are damaged: %s", reference, error)
             return None
 
+    @cachedmethod(attrgetter("_features"), lock=attrgetter("_lock"))
+    def _read_cached(self, reference: FeatureReference) -> ModelFeatures:
+        return self._read_stored(reference)
+
     def _read_stored(self, reference: FeatureReference) -> ModelFeatures:
         key, row = reference.object_key, reference.row
-        index = self._cached(self._indexes, key, partial(read_feature_index, self._store))
+        index = self._read_index(key)
         begin, end = index.row_range(row)
         if begin == end:
             raise NotFound("no_features", f"Row {row} of {key} has no local features.")
         return index.model, LocalFeatures.decode(self._store.read_range(key, begin, end - begin))
 
-    def _cached(
-        self, values: LRUCache[Key, Value], key: Key, read: Callable[[Key], Value]
-    ) -> Value:
-        with self._lock:
-            value = values.get(key)
-        if value is None:
-            value = read(key)
-            with self._lock:
-                values[key] = value
-        return value
+    @cachedmethod(attrgetter("_indexes"), lock=attrgetter("_lock"))
+    def _read_index(self, key: str) -> FeatureIndex:
+        return read_feature_index(self._store, key)
 
 
 def unusable_query_reason(query: ModelFeatures | None) -> str:

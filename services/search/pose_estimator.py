@@ -6,9 +6,11 @@ import logging
 import threading
 from collections.abc import Iterable
 from dataclasses import asdict
+from operator import attrgetter
+from typing import Any
 
 import numpy as np
-from cachetools import LRUCache
+from cachetools import LRUCache, cachedmethod
 
 from services.search.photo_matcher import PhotoMatcher, match_threads, unusable_query_reason
 from shared.errors import NotFound
@@ -42,7 +44,7 @@ class PoseEstimator:
         self._store = store
         self._photos = photos
         self._lock = threading.Lock()
-        self._components: LRUCache[str, Component] = LRUCache(
+        self._components: LRUCache[Any, Component] = LRUCache(
             CACHED_COMPONENT_BYTES, getsizeof=_size_bytes
         )
 
@@ -97,22 +99,17 @@ class PoseEstimator:
         return PoseResponse(pose=_to_message(pose, number, request.components[number]))
 
     def _read_component(self, key: str) -> Component | None:
-        with self._lock:
-            component = self._components.get(key)
-        if component is not None:
-            return component
         try:
-            component = Component.decode(self._store.get(key))
+            return self._read_cached(key)
         except NotFound:
             log.warning("the component %s of a reconstruction is missing", key)
-            return None
         except ValueError as error:
             log.warning("the component %s of a reconstruction is damaged: %s", key, error)
-            return None
-        with self._lock:
-            if _size_bytes(component) <= CACHED_COMPONENT_BYTES:
-                self._components[key] = component
-        return component
+        return None
+
+    @cachedmethod(attrgetter("_components"), lock=attrgetter("_lock"))
+    def _read_cached(self, key: str) -> Component:
+        return Component.decode(self._store.get(key))
 
 
 def _size_bytes(component: Component) -> int:
