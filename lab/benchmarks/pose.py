@@ -211,7 +211,7 @@ def measure_city(report: Report, count: int, progress: Progress) -> list[tuple[s
         write_city(plan, folder / "city", partial(progress.advance, bar))
         paths = [photo.path(folder / "city") for photo in plan.photos]
         features, _ = detect_all(detector, paths, partial(progress.advance, bar))
-        by_day = [n for n, p in enumerate(plan.photos) if _is_asked(p, "spring", "autumn")]
+        by_day = [n for n, p in enumerate(plan.photos) if _is_query_of(p, "spring", "autumn")]
         mirrored = _detect_changed(detector, [paths[n] for n in by_day[:other]], folder, _mirror)
         noise = _detect_changed(detector, paths[:20], folder, _noise)
         panoramas = _detect_changed(detector, [paths[n] for n in by_day[:40]], folder, _panorama)
@@ -232,8 +232,8 @@ def measure_city(report: Report, count: int, progress: Progress) -> list[tuple[s
     report.add("city: calibrated", time.perf_counter() - started, "s")
     report.add("city: quantile factor of 68 %", calibration.position_68)
     report.add("city: quantile factor of 95 %", calibration.position_95)
-    wanted = [n for n, photo in enumerate(plan.photos) if photo.role == "query"]
-    asked = {n: mapped.localise(features[n]) for n in wanted}
+    query_numbers = [n for n, photo in enumerate(plan.photos) if photo.role == "query"]
+    localised = {n: mapped.localise(features[n]) for n in query_numbers}
     report.add_latency("city: a pose", mapped.pose_seconds, p95_at_most_ms=1500)
     table = Table(
         "queries", "poses %", "median m", "heading", "in 68 %", "in 95 %", "radius m", title="city"
@@ -245,9 +245,9 @@ def measure_city(report: Report, count: int, progress: Progress) -> list[tuple[s
         ("winter", ("winter",)),
         ("night", ("night",)),
     ):
-        numbers = [n for n, p in enumerate(plan.photos) if _is_asked(p, *names)]
-        found = [n for n in numbers if isinstance(asked[n], LocalPose)]
-        judged = [_judge(asked[n], alignment, calibration, truth[n]) for n in found]
+        numbers = [n for n, p in enumerate(plan.photos) if _is_query_of(p, *names)]
+        found = [n for n in numbers if isinstance(localised[n], LocalPose)]
+        judged = [_judge(localised[n], alignment, calibration, truth[n]) for n in found]
         errors = np.array([each[0] for each in judged])
         headings = np.array(
             [
@@ -268,7 +268,7 @@ def measure_city(report: Report, count: int, progress: Progress) -> list[tuple[s
         limit(f"city, {what}: median heading", float(values[2]), "°", at_most=2 if day else None)
         _add_coverage(report, f"city, {what}", in_68, in_95)
         covered = np.array(
-            [[_judge(asked[n], off, calibration, truth[n])[:3] for n in found] for off in noisy]
+            [[_judge(localised[n], off, calibration, truth[n])[:3] for n in found] for off in noisy]
         )
         if day:
             in_68, in_95 = (
@@ -284,7 +284,7 @@ def measure_city(report: Report, count: int, progress: Progress) -> list[tuple[s
     outside = [n for n, photo in enumerate(plan.photos) if photo.kind == "out_of_map"]
     rng = np.random.default_rng(0)
     rows = [("city: photos of the map's streets", wrong, tried)]
-    rows.append(("another quarter", _accepted(asked[n] for n in outside), len(outside)))
+    rows.append(("another quarter", _accepted(localised[n] for n in outside), len(outside)))
     for what, changed in (("mirrored", mirrored), ("noise", noise), ("panoramas", panoramas)):
         rows.append((what, _accepted(map(mapped.localise, changed)), len(changed)))
     for factor in (0.6, 1.6):
@@ -318,7 +318,7 @@ def measure_floors(
     bar = progress.add_task("floors", total=len(paths) + len(queries) + 50 * len(names))
     advance = partial(progress.advance, bar)
     features = dict(zip(paths, detect_all(detector, paths, advance)[0], strict=True))
-    asked = dict(zip(queries, detect_all(detector, queries, advance)[0], strict=True))
+    of_queries = dict(zip(queries, detect_all(detector, queries, advance)[0], strict=True))
     table = Table(
         "floor",
         "photos",
@@ -336,9 +336,9 @@ def measure_floors(
         own = [path for path in paths if _floor(path) == name]
         seconds = np.array([_second(path, paths) for path in own])
         mapped = MappedPhotos([features[path] for path in own], detector.model, seconds)
-        poses = [mapped.localise(asked[path]) for path in queries if _floor(path) == name]
+        poses = [mapped.localise(of_queries[path]) for path in queries if _floor(path) == name]
         elsewhere = [path for path in queries if _floor(path) != name]
-        accepted = _accepted(mapped.localise(asked[path]) for path in elsewhere[::6])
+        accepted = _accepted(mapped.localise(of_queries[path]) for path in elsewhere[::6])
         others, others_tried = others + accepted, others_tried + len(elsewhere[::6])
         shares: list[float] = []
         left_out = []
@@ -407,7 +407,7 @@ def _add_coverage(report: Report, what: str, in_68: float, in_95: float) -> None
         report.add(f"{what}: within the radius of {name} %, not too many", share, "%", at_most=high)
 
 
-def _is_asked(photo: PlannedPhoto, *sessions: str) -> bool:
+def _is_query_of(photo: PlannedPhoto, *sessions: str) -> bool:
     return photo.role == "query" and photo.kind == "in_map" and photo.session.name in sessions
 
 
@@ -451,12 +451,12 @@ def _panorama(image: Image.Image) -> Image.Image:
 def _covered(query: LocalFeatures, foreign: LocalFeatures) -> LocalFeatures:
     """Return the features of a photo whose right two fifths show what another photo shows."""
     border = 0.6 * 65535
-    kept, added = query.positions[:, 0] < border, foreign.positions[:, 0] >= border
+    own, added = query.positions[:, 0] < border, foreign.positions[:, 0] >= border
     return LocalFeatures(
         query.width,
         query.height,
-        np.concatenate([query.positions[kept], foreign.positions[added]]),
-        np.concatenate([query.descriptors[kept], foreign.descriptors[added]]),
+        np.concatenate([query.positions[own], foreign.positions[added]]),
+        np.concatenate([query.descriptors[own], foreign.descriptors[added]]),
     )
 
 

@@ -59,9 +59,9 @@ def plan_round_trip(
         across, yaw, eye = rng.normal(0, 0.25), rng.normal(0, 2), rng.normal(1.9, 0.05)
         camera = _camera(drive, metres, across, yaw, DATABASE_FOV, eye, rng)
         photos.append(_photo("database", "map", camera, SUMMER, number))
-    wanted = [("map", session) for session, count in queries for _ in range(count)]
-    wanted += [("outskirts", queries[0][0])] * outside
-    for number, (quarter, session) in enumerate(wanted):
+    taken_in = [("map", session) for session, count in queries for _ in range(count)]
+    taken_in += [("outskirts", queries[0][0])] * outside
+    for number, (quarter, session) in enumerate(taken_in):
         path = _around(plan.quarters[quarter])
         metres, across = rng.uniform(0, path.along[-1]), rng.uniform(-ACROSS_M, ACROSS_M)
         yaw, fov = rng.uniform(-YAW_DEGREES, YAW_DEGREES), rng.uniform(*QUERY_FOV)

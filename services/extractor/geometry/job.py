@@ -480,16 +480,16 @@ def _to_json(proposal: CoordinateProposal, photo: Photo) -> dict[str, Any]:
 def _join_matches(new: VerifiedMatches, known: VerifiedMatches) -> VerifiedMatches:
     """Return the matches of both; photos of `known` that are gone have none."""
     numbers = {id_: number for number, id_ in enumerate(new.photo_ids)}
-    kept = [
+    known_pairs = [
         (pair, keypoints)
         for row, keypoints in zip(known.pairs.tolist(), known.keypoints, strict=True)
         if (pair := [numbers.get(known.photo_ids[number], -1) for number in row]) and min(pair) >= 0
     ]
-    pairs = np.array([*new.pairs.tolist(), *(pair for pair, _ in kept)], np.int32)
+    pairs = np.array([*new.pairs.tolist(), *(pair for pair, _ in known_pairs)], np.int32)
     return replace(
         new,
         pairs=pairs.reshape(-1, 2),
-        keypoints=(*new.keypoints, *(keypoints for _, keypoints in kept)),
+        keypoints=(*new.keypoints, *(keypoints for _, keypoints in known_pairs)),
     )
 
 

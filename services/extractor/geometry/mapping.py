@@ -417,7 +417,7 @@ def _without_shared_photos(models: Sequence[Any]) -> list[Any]:
 
     pycolmap lets the models of one run overlap. A photo in two frames would have two poses.
     """
-    kept: list[Any] = []
+    disjoint: list[Any] = []
     names: set[str] = set()
     for model in sorted(models, key=lambda model: -model.num_reg_images()):
         for number in list(model.reg_image_ids()):
@@ -425,9 +425,9 @@ def _without_shared_photos(models: Sequence[Any]) -> list[Any]:
                 model.deregister_frame(model.image(number).frame_id)
         is_enough = model.num_reg_images() >= MIN_MODEL_PHOTOS
         if is_enough and model.num_points3D() >= MIN_MODEL_POINTS:
-            kept.append(model)
+            disjoint.append(model)
             names.update(_names(model))
-    return kept
+    return disjoint
 
 
 def _component_of(

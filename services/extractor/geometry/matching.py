@@ -95,9 +95,9 @@ def match_pairs(
         for start in range(0, len(pairs), BLOCK):
             found += pool.map(match, pairs[start : start + BLOCK].tolist())
             on_progress(len(found))
-    is_kept = np.array([len(matches) >= MIN_INLIERS for matches in found], dtype=bool)
+    is_enough = np.array([len(matches) >= MIN_INLIERS for matches in found], dtype=bool)
     return VerifiedMatches(
         tuple(photos),
-        pairs[is_kept],
-        tuple(matches for matches, kept in zip(found, is_kept, strict=True) if kept),
+        pairs[is_enough],
+        tuple(matches for matches, enough in zip(found, is_enough, strict=True) if enough),
     )

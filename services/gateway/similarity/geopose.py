@@ -54,13 +54,13 @@ GeoPoseDep = Annotated[bool, Depends(_accepts_geopose)]
 """Whether the answer is to be a GeoPose."""
 
 
-def with_geopose(answer: SimilarityResponse, search_params: SearchParams, wanted: bool) -> Any:
-    """Return the answer, or its pose as GeoPose if that is wanted.
+def with_geopose(answer: SimilarityResponse, search_params: SearchParams, accepted: bool) -> Any:
+    """Return the answer, or its pose as GeoPose if that is accepted.
 
     Raises:
         Unprocessable: `no_pose`.
     """
-    if not wanted:
+    if not accepted:
         return answer
     if answer.pose is None:
         raise Unprocessable(
