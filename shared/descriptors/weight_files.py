@@ -17,6 +17,7 @@ import hashlib
 import pickle
 import re
 import time
+import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -302,10 +303,20 @@ def check_declared_size(tensors: Iterable[torch.Tensor], path: Path) -> None:
 
 
 def _check_entries(path: Path) -> None:
-    # PyTorch's own reader: another one may find other entries in a hostile archive.
-    archive = torch._C.PyTorchFileReader(str(path))
-    declared = sum(archive.get_record_size(name) for name in archive.get_all_records())
-    size = path.stat().st_size
+    """Raise ValueError if the entries of an archive declare more bytes than it has."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+    except (zipfile.BadZipFile, NotImplementedError) as error:
+        raise ValueError(f"it is a damaged archive: {error}") from error
+    # PyTorch's own reader, which not all releases let tell sizes, may find others in a hostile one.
+    reader = torch._C.PyTorchFileReader(str(path))
+    read = {name: reader.get_record_header_offset(name) for name in reader.get_all_records()}
+    if read != {each.filename.partition("/")[2]: each.header_offset for each in entries}:
+        raise ValueError(
+            "two readers find other entries in it. Save the file again with torch.save"
+        )
+    declared, size = sum(each.file_size for each in entries), path.stat().st_size
     if declared > size:
         raise ValueError(
             f"its entries declare {declared} bytes, and the file has {size}: they are compressed "
