@@ -237,6 +237,12 @@ def load_tensors(path: Path) -> Any:
     return torch.load(path, map_location="cpu", weights_only=True, mmap=is_archive)
 
 
+def is_safetensors(path: Path) -> bool:
+    """Whether a file has the format by its content: blobs in the hub's cache have no suffix."""
+    with path.open("rb") as file:
+        return file.read(9)[8:] == b"{"
+
+
 Shape = tuple[int, ...]
 
 
@@ -256,9 +262,7 @@ def open_tensor_file(path: Path) -> TensorFile:
     Raises:
         One of TENSOR_READ_ERRORS, also for a file without tensors.
     """
-    with path.open("rb") as file:
-        begin = file.read(9)
-    if begin[8:] == b"{":  # by content: blobs in a Hugging Face cache have no suffix
+    if is_safetensors(path):
         stored: Any = safe_open(path, framework="pt", device="cpu")  # untyped methods
         shapes = {name: tuple(stored.get_slice(name).get_shape()) for name in stored.keys()}  # noqa: SIM118
         return TensorFile(path, shapes, stored.get_tensor)
