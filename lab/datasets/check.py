@@ -29,7 +29,6 @@ from lab.datasets.ground_truth import (
     heading_differences,
     parse_rule,
 )
-from lab.datasets.layouts.folder_pairs import PAIRED_BY_POSITION
 from lab.datasets.open_dataset import (
     find_evaluation_sets,
     find_training_layout,
@@ -169,14 +168,6 @@ def _find_problems(evaluation: EvaluationSet) -> Iterator[DatasetProblem]:
     shared = [photo.name for photo in evaluation.queries if photo.path in database_paths]
     if shared:
         yield _problem("query_in_database", shared, f"queries of {name} are also database photos")
-    counts = [len(evaluation.database), len(evaluation.queries)]
-    if evaluation.paired_by == PAIRED_BY_POSITION and counts[0] != counts[1]:
-        yield DatasetProblem(
-            "seasons_differ",
-            abs(counts[0] - counts[1]),
-            f"The seasons of {name} have {counts[0]} and {counts[1]} photos whose names have no "
-            "numbers in common: the n-th photo of one is taken for the n-th of the other.",
-        )
     differing = _differing_positives(evaluation)
     if differing:
         yield _problem(

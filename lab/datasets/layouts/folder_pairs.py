@@ -38,7 +38,6 @@ RIDES = "rides"
 SEASONS = ("summer", "spring", "fall", "autumn", "winter")
 """Names of folders of one season each; the database is the first one that exists"""
 SAME_INDEX_RULE = "frames 10"
-PAIRED_BY_NUMBER, PAIRED_BY_POSITION = "the number in the name", "position in the sorted folder"
 MIN_COMMON_SHARE = 0.5
 """Share of the shorter season's numbers that the other one has, too; counters of days differ"""
 VME_PROTOCOL = "vme"
@@ -119,10 +118,10 @@ def _pair_seasons(before: Sequence[DatasetPhoto], after: Sequence[DatasetPhoto])
     best = max(pairs, key=lambda pair: len(set(pair[0]).intersection(pair[1])), default=((), ()))
     common = len(set(best[0]).intersection(best[1]))
     if not common or common < MIN_COMMON_SHARE * min(len(before), len(after)):
-        numbered, paired_by = (_number(before), _number(after)), PAIRED_BY_POSITION
+        best, paired_by = ((), ()), "their positions in the sorted folders"
     else:
-        numbered = _number(before, best[0]), _number(after, best[1])
-        paired_by = PAIRED_BY_NUMBER
+        paired_by = "the number in their names"
+    numbered = _number(before, best[0]), _number(after, best[1])
     return ListedSet(*numbered, SAME_INDEX_RULE, paired_by=paired_by)
 
 
