@@ -196,8 +196,6 @@ def resample_positions(
     side = math.isqrt(positions.shape[1])
     if (rows, columns) == (side, side):
         return positions
-    if positions.is_meta:  # PyTorch 2.7 interpolates it on the CPU
-        return positions.new_empty(1, rows * columns, positions.shape[2])
     grid = positions.float().reshape(1, side, side, -1).permute(0, 3, 1, 2)
     if registers:
         resampled = interpolate(grid, size=(rows, columns), mode="bicubic", antialias=True)

@@ -1,8 +1,8 @@
-"""What the code calls of PyTorch exists in 2.7, the oldest release that `pyproject.toml` allows.
+"""What the code calls of PyTorch exists in 2.11, the oldest release that `pyproject.toml` allows.
 
-`torch_2_7_names.txt` lists the names that were found there; add one only after looking it up in
+`torch_2_11_names.txt` lists the names that were found there; add one only after looking it up in
 that release. Methods of its private archive reader have no names in the code, so the reader is
-replaced by one that has those of 2.7 alone.
+replaced by one that has those of 2.11 alone.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from shared.descriptors.backbones.exported import exported_prefix
 from shared.descriptors.weight_files import _check_entries
 
 ROOT = Path(__file__).parents[3]
-NAMES = Path(__file__).with_name("torch_2_7_names.txt")
+NAMES = Path(__file__).with_name("torch_2_11_names.txt")
 READER_METHODS = {
     *("get_all_records", "get_record", "get_record_header_offset", "get_record_offset"),
     *("get_record_offset_no_read", "get_storage_from_record", "has_record", "serialization_id"),
