@@ -314,7 +314,7 @@ def _check_entries(path: Path) -> None:
     except (zipfile.BadZipFile, NotImplementedError) as error:
         raise ValueError(f"it is a damaged archive: {error}") from error
     # PyTorch's own reader, which not all releases let tell sizes, may find others in a hostile one.
-    reader = torch._C.PyTorchFileReader(str(path))
+    reader: Any = torch._C.PyTorchFileReader(str(path))
     read = {name: reader.get_record_header_offset(name) for name in reader.get_all_records()}
     if read != {each.filename.partition("/")[2]: each.header_offset for each in entries}:
         raise ValueError(

@@ -276,8 +276,8 @@ class ReconstructionJob:
             if model is None:
                 current = self._find_extendable(photos)
                 existing = self._fetch_models(Path(scratch), current) if current else []
-                for stored in current.list_components() if current else []:
-                    known |= Component.decode(self._store.get(stored.object_key)).rays()
+                for each in current.list_components() if current else []:
+                    known |= Component.decode(self._store.get(each.object_key)).rays()
                 found = map_photos(to_map, matches, folder, report, self._progress.check, existing)
             else:
                 source = Path(scratch, "model")
@@ -287,7 +287,7 @@ class ReconstructionJob:
                 to_map = [self._with_header(photo, photos[photo.id].row) for photo in to_map]
                 found = import_model(to_map, names, matches, folder, source, self._progress.check)
             if known:
-                found = [replace(each, component=each.component.with_rays(known)) for each in found]
+                found = [replace(one, component=one.component.with_rays(known)) for one in found]
             stored = [
                 self._store_component(made.id, number, each) for number, each in enumerate(found)
             ]

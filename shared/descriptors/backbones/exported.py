@@ -35,7 +35,7 @@ from shared.imaging.preprocessing import get_preprocessing
 
 ONNX_MEMORY_BYTES = 4_000_000_000  # of all ONNX networks of a process, with their weights
 
-ONNX_TYPES = {
+ONNX_TYPES: dict[str, np.dtype[Any]] = {
     "tensor(float)": np.dtype("f4"),
     "tensor(float16)": np.dtype("f2"),
     "tensor(double)": np.dtype("f8"),

@@ -155,7 +155,9 @@ def _find_tensors(stored: dict[str, Any], path: Path) -> Mapping[str, Any]:
             isinstance(value, torch.Tensor) for value in entry.values()
         )
 
-    found = {name: entry for name, entry in stored.items() if holds_tensors(entry)}
+    found: dict[str, Mapping[str, Any]] = {
+        name: entry for name, entry in stored.items() if holds_tensors(entry)
+    }
     for name in STATE_DICT_NAMES:
         if name in found:
             return found[name]

@@ -56,17 +56,13 @@ def cosplace(backbone: str) -> tuple[nn.Sequential, Tensors]:
     with torch.device("meta"):
         layers = cosplace_layers(backbone)
     draw_weights(layers)
-    channels = next(m.out_channels for m in reversed(list(layers.modules())) if is_conv(m))
+    channels = [m.out_channels for m in layers.modules() if isinstance(m, nn.Conv2d)][-1]
     head = {
         "aggregation.1.p": torch.tensor([2.5]),
         "aggregation.3.weight": torch.randn(32, channels),
         "aggregation.3.bias": torch.randn(32),
     }
     return layers, {f"backbone.{n}": t for n, t in layers.state_dict().items()} | head
-
-
-def is_conv(module: nn.Module) -> bool:
-    return isinstance(module, nn.Conv2d)
 
 
 @pytest.mark.parametrize(
@@ -103,11 +99,12 @@ def megaloc() -> Tensors:
     # Only the head differs from SALAD: the transformer is compared with a reference elsewhere.
     vit = load_vit()
     head = {}
-    for name, sizes in {
+    layers: dict[str, list[tuple[int, ...]]] = {
         "token_features": [(512, WIDTH), (TOKEN_DIM, 512)],
         "cluster_features": [(512, WIDTH, 1, 1), (CLUSTER_DIM, 512, 1, 1)],
         "score": [(512, WIDTH, 1, 1), (CLUSTERS, 512, 1, 1)],
-    }.items():
+    }
+    for name, sizes in layers.items():
         last = 2 if name == "token_features" else 3
         for number, size in zip((0, last), sizes, strict=True):
             head[f"agg.{name}.{number}.weight"] = torch.randn(size) / size[1] ** 0.5
@@ -136,7 +133,8 @@ def sinkhorn(scores: NDArray[np.float64], dustbin: float) -> NDArray[np.float64]
     for _ in range(3):
         u = masses / (kernel @ v)
         v = 1 / (kernel.T @ u)
-    return (u[:, None] * kernel * v)[:clusters]
+    found: NDArray[np.float64] = (u[:, None] * kernel * v)[:clusters]
+    return found
 
 
 def megaloc_head(t: Tensors, maps: torch.Tensor, token: torch.Tensor) -> NDArray[np.float64]:
@@ -159,7 +157,8 @@ def megaloc_head(t: Tensors, maps: torch.Tensor, token: torch.Tensor) -> NDArray
     first = mlp("token_features", token.double().numpy()[None])[0]
     row = np.concatenate([first / np.linalg.norm(first), clusters.ravel()])
     row = w["linear.weight"] @ (row / np.linalg.norm(row)) + w["linear.bias"]
-    return np.asarray(row / np.linalg.norm(row))
+    found: NDArray[np.float64] = row / np.linalg.norm(row)
+    return found
 
 
 @pytest.mark.parametrize("suffix", [".torch", ".safetensors"])

@@ -237,7 +237,7 @@ def test_rays_of_a_camera_of_any_model_are_those_of_its_turned_photos(name: str)
     params[camera.extra_params_idxs()] = np.linspace(0.004, 0.01, len(camera.extra_params_idxs()))
     if name in ("EUCM", "FOV"):
         params[camera.extra_params_idxs()] = (0.6, 1.1) if name == "EUCM" else 0.8
-    camera.params = params
+    camera.params = params.tolist()
     rays = Rays.fit(camera.cam_ray_from_img, (640, 480), 400 / 640, bytes(32), 0)
     pixels = np.random.default_rng(0).uniform((60, 60), (580, 420), (50, 2))
     seen = np.array(camera.cam_from_img(pixels))
