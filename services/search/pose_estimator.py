@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from operator import attrgetter
 from typing import Any
 
@@ -14,7 +14,7 @@ from cachetools import LRUCache, cachedmethod
 
 from services.search.photo_matcher import PhotoMatcher, match_threads, unusable_query_reason
 from shared.errors import NotFound
-from shared.geometry.cameras import Camera, CameraSource
+from shared.geometry.cameras import Camera, CameraSource, hash_camera_key
 from shared.geometry.component import Component, quaternion_of
 from shared.geometry.frames import EastNorthUp, Similarity
 from shared.geometry.localise import LocalPose, NoPose, localise
@@ -123,18 +123,32 @@ def _camera(
 ) -> tuple[Camera | None, CameraSource]:
     """Return the camera of the query, if it is known, and where it comes from.
 
-    That of a photo of the reconstruction was refined together with it.
+    That of a photo of the reconstruction was refined together with it. An imported one has a
+    principal point and distortion, too, so it serves all that it took.
     """
-    width, height = query.width, query.height
-    if request.focal_length is not None:
-        camera = Camera.of_focal_length(width, height, request.focal_length)
+    size = query.width, query.height
+    known = next(filter(None, (_find_camera(request, each) for each in components)), None)
+    if request.focal_length is None:
+        return (known.resized(*size), CameraSource.MAP) if known else (None, CameraSource.ESTIMATED)
+    if known is None or known.rays is None:
+        camera = Camera.of_focal_length(*size, request.focal_length)
         return camera, CameraSource(request.camera_source)
-    for component in components:
-        for row, photo_id in enumerate(component.photo_ids):
-            if photo_id in request.leave_out:
-                camera = component.cameras[component.camera_numbers[row]]
-                return camera.resized(width, height), CameraSource.MAP
-    return None, CameraSource.ESTIMATED
+    if request.camera_source == CameraSource.GIVEN:
+        return known.resized(*size).with_focal_length(request.focal_length), CameraSource.GIVEN
+    return known.resized(*size), CameraSource.MAP
+
+
+def _find_camera(request: PoseRequest, component: Component) -> Camera | None:
+    """Return the camera of the query as that of a photo that is left out, or by its key."""
+    for row, photo_id in enumerate(component.photo_ids):
+        if photo_id in request.leave_out:
+            return component.cameras[component.camera_numbers[row]]
+    if request.camera_key is None:
+        return None
+    camera = component.find_camera(hash_camera_key(request.camera_key))
+    if camera is None or camera.rays is None:
+        return None
+    return replace(camera, rays=camera.rays.turned(request.quarter_turns))
 
 
 def _to_message(pose: LocalPose, number: int, component: PoseComponent) -> ComponentPose:

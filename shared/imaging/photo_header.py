@@ -39,6 +39,7 @@ GPS_TAGS = (
     GPS.GPSImgDirection,
 )
 ROTATED_ORIENTATIONS = (5, 6, 7, 8)  # EXIF orientations that swap width and height
+QUARTER_TURNS = {1: 0, 6: 1, 3: 2, 8: 3, **dict.fromkeys((2, 4, 5, 7))}  # clockwise; None: mirrored
 BELOW_ZERO = (b"\1", b"\3")  # GPSAltitudeRef: below the sea, below the ellipsoid
 MAX_ALTITUDE_M = 100_000
 EXIF_INCH = 2  # the default of FocalPlaneResolutionUnit
@@ -65,6 +66,16 @@ class PhotoHeader:
     """make, model and serial number"""
     focal_length: float | None = None
     """multiple of the longer side"""
+    quarter_turns: int | None = 0
+    """clockwise, by which EXIF says that the pixels are turned upright; None if also mirrored"""
+
+    @property
+    def camera_key(self) -> str | None:
+        """What photos of one camera, zoom and size have in common; None without make and model."""
+        if self.camera is None or self.quarter_turns is None:
+            return None
+        size = (self.width, self.height)[:: -1 if self.quarter_turns % 2 else 1]
+        return f"{self.camera} {size[0]}x{size[1]} {self.focal_length or 0:.3f}"
 
 
 def read_photo_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
@@ -79,7 +90,8 @@ def read_photo_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
     width, height, exif = structure.width, structure.height, structure.exif
     check_pixel_count(width, height, max_pixels)
     main = _directory(exif, exif and exif.first_offset, MAIN_TAGS)
-    if not structure.is_upright and main.get(Base.Orientation) in ROTATED_ORIENTATIONS:
+    orientation = 1 if structure.is_upright else main.get(Base.Orientation)
+    if orientation in ROTATED_ORIENTATIONS:
         width, height = height, width
     details = _directory(exif, main.get(IFD.Exif), CAMERA_TAGS)
     gps = _directory(exif, main.get(IFD.GPSInfo), GPS_TAGS)
@@ -101,6 +113,7 @@ def read_photo_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
         time_zone_is_known=gps_time is not None or time_zone_is_known,
         camera=_camera(main, details),
         focal_length=_focal_length(details, structure.width, structure.height),
+        quarter_turns=QUARTER_TURNS.get(orientation, 0) if isinstance(orientation, int) else 0,
     )
 
 

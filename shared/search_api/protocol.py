@@ -269,6 +269,10 @@ class PoseRequest(_Message):
     """as a multiple of the query's longer side; None if it has to be estimated"""
     camera_source: str
     """where `focal_length` comes from: a `shared.geometry.cameras.CameraSource`"""
+    camera_key: str | None = None
+    """`PhotoHeader.camera_key` of the query"""
+    quarter_turns: int = 0
+    """clockwise, by which the query was turned upright"""
     leave_out: tuple[UUID, ...] = ()
     """photos whose own points are not used: the query, if it is one of the map"""
 

@@ -97,14 +97,14 @@ def localise_left_out(
         similarities = np.where(near, -np.inf, descriptors @ descriptors[row])
         best = np.argsort(-similarities, kind="stable")[: min(CANDIDATES, int((~near).sum()))]
         photo = component.photo_ids[row]
-        query, focal_length = features[photo], focal_lengths[row]
-        camera = focal_length and Camera.of_focal_length(query.width, query.height, focal_length)
+        query = features[photo]
+        camera, source = _query_camera(component, row, query, focal_lengths[row])
         found = localise(
             query,
             [(component.photo_ids[i], features[component.photo_ids[i]]) for i in best.tolist()],
             [component],
-            camera or None,
-            CameraSource.EXIF if camera else CameraSource.ESTIMATED,
+            camera,
+            source,
             matcher,
             frozenset(component.photo_ids[i] for i in np.flatnonzero(near).tolist()),
         )
@@ -116,6 +116,19 @@ def localise_left_out(
             done.append(found)
             on_progress(len(done))
     return done
+
+
+def _query_camera(
+    component: Component, row: int, query: LocalFeatures, focal_length: float | None
+) -> tuple[Camera | None, CameraSource]:
+    """Return the camera that a query of the same camera as a photo would have."""
+    camera = component.cameras[component.camera_numbers[row]]
+    if camera.rays is not None and any(camera.rays.camera_key):
+        return camera.resized(query.width, query.height), CameraSource.MAP
+    if focal_length is None:
+        return None, CameraSource.ESTIMATED
+    camera = Camera.of_focal_length(query.width, query.height, focal_length)
+    return camera, CameraSource.EXIF
 
 
 def _compare(

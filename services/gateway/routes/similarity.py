@@ -184,9 +184,7 @@ def _queue_query(
         with gateway.catalog.write() as session:
             map_ = get_map(session, map_name)
             check_matching_enabled(map_, search_params)
-            job = describe_query_job(
-                job_id, map_.id, upload.filename, search_params, header.focal_length
-            )
+            job = describe_query_job(job_id, map_.id, upload.filename, search_params, header)
             idempotent.store_job_response(session, job)
     gateway.wakeups.send(WakeupQueue.QUERY)
     return job

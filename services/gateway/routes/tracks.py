@@ -345,9 +345,7 @@ def _accept_frame(
                 # A pose without coordinates says nothing to the filter.
                 posed = SearchParams(matches=0, pose=gives_coordinates(session, track.map_id))
                 session.add(
-                    describe_query_job(
-                        job_id, track.map_id, received.filename, posed, header.focal_length
-                    )
+                    describe_query_job(job_id, track.map_id, received.filename, posed, header)
                 )
             response = _frame_response(stored, map_name)
             headers = accepted_headers(response.frame_url)

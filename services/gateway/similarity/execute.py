@@ -108,6 +108,10 @@ class SimilarityQuery:
     filename: str
     focal_length: float | None = None
     """From the photo's EXIF, as a multiple of its longer side; None if it is not known"""
+    camera_key: str | None = None
+    """Of a query photo: `PhotoHeader.camera_key`"""
+    quarter_turns: int = 0
+    """Clockwise, by which the query photo was turned upright"""
     background: tuple[RowReference, ...] = ()
     """Descriptors whose mean is subtracted from the query"""
 
@@ -167,6 +171,8 @@ def query_from_job(gateway: GatewayContext, job: Job) -> SimilarityQuery:
             photo_id=None,
             filename=job.params["filename"],
             focal_length=job.params.get("focal_length"),
+            camera_key=job.params.get("camera_key"),
+            quarter_turns=job.params.get("quarter_turns") or 0,
         )
 
 

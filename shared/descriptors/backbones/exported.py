@@ -12,10 +12,12 @@ for any amount of memory: both are refused.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import io
 import os
+import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +26,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from shared.descriptors.backbones import NetworkBackbone, find_descriptor_fault
+from shared.descriptors.backbones import NetworkBackbone, find_descriptor_fault, probe_photos
 from shared.descriptors.weight_files import first_error_line
 from shared.errors import Misconfigured, Unprocessable
 from shared.extractor_config.configs import ExtractorConfig
@@ -33,7 +35,21 @@ from shared.imaging.preprocessing import get_preprocessing
 
 ONNX_MEMORY_BYTES = 4_000_000_000  # of all ONNX networks of a process, with their weights
 
+ONNX_TYPES: dict[str, np.dtype[Any]] = {
+    "tensor(float)": np.dtype("f4"),
+    "tensor(float16)": np.dtype("f2"),
+    "tensor(double)": np.dtype("f8"),
+    "tensor(uint8)": np.dtype("u1"),
+}
+"""Of photos, by ONNX Runtime's names"""
+FIXED_BATCHES = (4, 8, 16, 32, 64)
+"""Tried with a network that fails with two photos and one"""
+
 Network = Callable[[torch.Tensor], Any]
+
+
+class _UnsuitableInput(Exception):
+    """What a network expects as its input is nothing that it can get."""
 
 
 class ExportedBackbone(NetworkBackbone):
@@ -80,6 +96,8 @@ class ExportedBackbone(NetworkBackbone):
                 self.network = _open_torchscript(data, device)
         except Misconfigured:
             raise
+        except _UnsuitableInput as error:
+            raise self._unusable_error(str(error)) from error
         except Exception as error:  # ONNX Runtime's own types have no other base
             raise self._unusable_error(
                 f"it can't be read ({first_error_line(error)}). Weights of an ONNX file that are "
@@ -119,7 +137,8 @@ class ExportedBackbone(NetworkBackbone):
         try:
             both, alone = self.probe(*size)
         except ValueError as error:
-            raise self._unusable_error(str(error)) from error
+            reason = str(error) + self._find_cause(probe_photos(*size))
+            raise self._unusable_error(reason) from error
         fault = None
         if self.layer == "patches":
             shape = tuple(getattr(both, "shape", ()))
@@ -136,6 +155,18 @@ class ExportedBackbone(NetworkBackbone):
         if fault is not None:
             raise self._unusable_error(fault)
         return int(both.shape[1])
+
+    @torch.inference_mode()
+    def _find_cause(self, photos: torch.Tensor) -> str:
+        """Return, as part of a sentence, why the network fails with two photos and one."""
+        graph = getattr(self.network, "inlined_graph", "")
+        if device := re.search(r'"(cuda(:\d+)?)"', str(graph)):
+            return f". Its code names the device {device[1]}: trace or script it on the CPU"
+        for count in FIXED_BATCHES:
+            with contextlib.suppress(Exception):  # networks of others may raise anything
+                self._forward(photos[:1].expand(count, -1, -1, -1))
+                return f". It takes batches of {count} only: export it for any number of photos"
+        return ""
 
     def _unusable_error(self, reason: str) -> Unprocessable:
         return Unprocessable(
@@ -162,10 +193,13 @@ def exported_prefix(path: Path, filename: str) -> str | None:
 def _open_torchscript(data: bytes, device: torch.device) -> Network:
     """Load a TorchScript module, which executes its code."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # of a format that others go on publishing
+        warnings.simplefilter("ignore")  # of a format that others go on publishing
         module = torch.jit.load(io.BytesIO(data), map_location=device)  # type: ignore[no-untyped-call]
     network: Network = module.eval()
-    return network
+    stored = next((each.dtype for each in module.parameters()), torch.float32)
+    if stored == torch.float32 or not stored.is_floating_point:
+        return network
+    return lambda batch: network(batch.to(stored) if batch.is_floating_point() else batch)
 
 
 def _open_onnx(data: bytes) -> Network:
@@ -190,12 +224,23 @@ def _open_onnx(data: bytes) -> Network:
     session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     inputs = session.get_inputs()
     if len(inputs) != 1:
-        raise ValueError(f"it has {len(inputs)} inputs, expected photos only")
+        raise _UnsuitableInput(f"it has {len(inputs)} inputs, expected photos only")
+    if inputs[0].type not in ONNX_TYPES:
+        raise _UnsuitableInput(f"its input is a {inputs[0].type}. Export it for float32")
+    (count, *_) = inputs[0].shape or [None]
+    if isinstance(count, int) and count > 1:
+        raise _UnsuitableInput(
+            f"its input has a fixed batch of {count} photos. Export it for one, or for any number "
+            "(a dynamic axis)"
+        )
     output = session.get_outputs()[0].name
-    one_by_one = inputs[0].shape[:1] == [1]  # as many exports are
+    one_by_one = count == 1  # as many exports are
+    kind = ONNX_TYPES[inputs[0].type]
 
     def run(batch: torch.Tensor) -> torch.Tensor:
         array = np.ascontiguousarray(batch.cpu().numpy())
+        if array.dtype.kind == kind.kind == "f":
+            array = array.astype(kind)
         parts = np.split(array, len(array)) if one_by_one else [array]
         rows = [session.run([output], {inputs[0].name: part})[0] for part in parts]
         return torch.from_numpy(np.concatenate(rows))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import re
 import sys
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from onnx import TensorProto, helper
+from onnx.numpy_helper import from_array
 from torch.nn.functional import normalize
 
 from shared.descriptors.backbones import normalise_pixels, probe_photos
@@ -72,7 +74,11 @@ def operators(
         nodes,
         "graph",
         [helper.make_tensor_value_info("x", kind, shape)],
-        [helper.make_tensor_value_info("y", TensorProto.FLOAT, None)],
+        [
+            helper.make_tensor_value_info(
+                "y", TensorProto.FLOAT if kind == TensorProto.UINT8 else kind, None
+            )
+        ],
         constants,
     )
     opset = helper.make_opsetid("", 17)
@@ -204,6 +210,51 @@ def test_a_damaged_file_is_refused(kind: str, tiny_onnx: Callable[[bool], bytes]
     data = tiny_torchscript() if kind == "torchscript" else tiny_onnx(False)
     for damaged in (data[: len(data) // 2], b"", b"\x00" * 100, b"\xff" * 100, data[::-1]):
         assert "can't be read" in refusal(f"{kind}:x:{SIZE}", damaged)
+
+
+def test_networks_of_half_precision_describe_as_their_copies_of_float32(tmp_path: Path) -> None:
+    half = copy.deepcopy(tiny_network()).half()
+    script = torchscript_of(half)
+    weights = half.projection.float().numpy()
+    nodes = [
+        helper.make_node("AveragePool", ["x"], ["a"], kernel_shape=[8, 8], strides=[8, 8]),
+        helper.make_node("Flatten", ["a"], ["f"]),
+        helper.make_node("MatMul", ["f", "w"], ["y"]),
+    ]
+    found, expected = (
+        backbone(f"onnx:half:{SIZE}", operators(nodes, [from_array(weights.astype(t), "w")], kind))
+        for t, kind in (("f2", TensorProto.FLOAT16), ("f4", TensorProto.FLOAT))
+    )
+    rows = expected.features(PHOTOS)
+    for network in (found, backbone(f"torchscript:half:{SIZE}", script)):
+        cosines = (network.features(PHOTOS) * rows).sum(dim=-1)
+        assert cosines.min() > 0.999
+    integers = [helper.make_node("Flatten", ["x"], ["y"])]
+    assert "tensor(int32)" in refusal(f"onnx:x:{SIZE}", operators(integers, [], TensorProto.INT32))
+
+
+class FixedBatch(torch.nn.Module):
+    """As traced code is: with the batch of its example."""
+
+    def forward(self, batch: torch.Tensor) -> torch.Tensor:
+        return torch.nn.functional.avg_pool2d(batch, 8).reshape(4, 192)
+
+
+class FixedDevice(torch.nn.Module):
+    """As traced code is: with the device of its example."""
+
+    def forward(self, batch: torch.Tensor) -> torch.Tensor:
+        return batch.flatten(1) + torch.zeros(1, device=torch.device("cuda:7"))
+
+
+def test_a_network_of_a_fixed_batch_or_another_device_is_refused_with_the_cause(
+    tmp_path: Path,
+) -> None:
+    data = onnx_of(tiny_network(), tmp_path, batch_size=4)
+    assert "fixed batch of 4 photos" in refusal(f"onnx:x:{SIZE}", data)
+    name = f"torchscript:x:{SIZE}"
+    assert "takes batches of 4 only" in refusal(name, torchscript_of(FixedBatch()))
+    assert "names the device cuda:7" in refusal(name, torchscript_of(FixedDevice()))
 
 
 def test_an_onnx_file_that_names_other_files_is_refused_with_how_to_save_it_as_one(
