@@ -15,7 +15,7 @@ import json
 import logging
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -132,7 +132,15 @@ def model_cache_folder(settings: Settings) -> Path:
 class AddedModelLoader:
     """Loads added models by name, as the catalog describes them."""
 
-    def __init__(self, catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
+    def __init__(
+        self,
+        catalog: Catalog,
+        store: ObjectStore,
+        settings: Settings,
+        is_stopping: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """`is_stopping` is whether a pass of an ONNX file must end (`OnnxProcess`)."""
+        self._is_stopping = is_stopping
         self._catalog = catalog
         self._settings = settings
         self._cache = ModelFileCache(store, model_cache_folder(settings), MODEL_CACHE_BYTES)
@@ -158,7 +166,14 @@ class AddedModelLoader:
             path = self._cache.local_path(row.object_key, row.sha256)
             if config.input is not None:
                 data = path.read_bytes()
-                return ExportedBackbone(config, data, device, licence=row.licence, card=row.card)
+                return ExportedBackbone(
+                    config,
+                    data,
+                    device,
+                    licence=row.licence,
+                    card=row.card,
+                    is_stopping=self._is_stopping,
+                )
             model = read_model_file(path)
         except NotFound as error:
             raise Unavailable(
@@ -251,7 +266,9 @@ def _read_exported(
     sha256 = hashlib.sha256(data).hexdigest()
     if prefix == TORCHSCRIPT_PREFIX:
         context.settings.check_torchscript_allowed(name, sha256)
-    backbone = ExportedBackbone(config, data, torch.device("cpu"), card=card)
+    backbone = ExportedBackbone(
+        config, data, torch.device("cpu"), card=card, is_stopping=context.is_stopping
+    )
     assert config.input is not None
     size = config.input.height and [config.input.height, config.input.width]
     new = Model(

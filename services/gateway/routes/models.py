@@ -105,12 +105,13 @@ class ModelResponse(ResponseModel):
 
     @classmethod
     def of(cls, session: Session, model: Model) -> ModelResponse:
-        assert model.config is not None
+        config = model.config or {}
         maps = list_maps_using_model(session, model)
         return cls.of_row(
             model,
-            extractor=model.config.get("extractor", model.name),
-            image_size=model.config["image_size"],
+            config=config,
+            extractor=config.get("extractor", model.name),
+            image_size=config.get("image_size"),
             maps=maps,
         )
 
