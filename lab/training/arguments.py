@@ -15,6 +15,7 @@ from __future__ import annotations
 import ast
 import difflib
 import json
+import os
 import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -295,6 +296,7 @@ def suggest_name(name: str, known: Iterable[str]) -> str:
     return f" Known: {', '.join(names)}."
 
 
+TORCHVISION_NAMES = ("resnet", "resnext", "swin_t", "efficientnet_b")
 GPU_DEVICE_FILES = ("nvidia*", "nvhost*", "kfd", "dxg")
 """Files in /dev of NVIDIA's drivers, AMD's driver and WSL"""
 
@@ -308,7 +310,30 @@ def find_early_obstacles(arguments: TrainingArguments) -> list[PlacewiseError]:
     needs_data_root = arguments.experiment_phase != "test" or not arguments.eval_roots
     if arguments.data_root is None and needs_data_root:
         obstacles.append(data_root_error())
+    if obstacles and (reason := _find_missing_weights(arguments)):
+        obstacles.append(Misconfigured("weights_missing", reason))
     return obstacles
+
+
+def _find_missing_weights(arguments: TrainingArguments) -> str | None:
+    """Return what is missing if the weights of torchvision's networks are not on this machine.
+
+    That alone does not keep a run from starting where they can be downloaded.
+    """
+    name = arguments.backbone_arch.lower().replace("-", "_")
+    if not arguments.pretrained or arguments.experiment_phase == "test":
+        return None
+    if arguments.weights is not None:
+        return None if arguments.weights.is_file() else f"{arguments.weights} is not a file."
+    cache = os.environ.get("XDG_CACHE_HOME", "~/.cache")
+    home = os.environ.get("TORCH_HOME", f"{cache}/torch")
+    folder = Path(home, "hub", "checkpoints").expanduser()  # `torch.hub.get_dir`
+    if not name.startswith(TORCHVISION_NAMES) or any(folder.glob(f"{name}-*.pth")):
+        return None
+    return (
+        f"{folder} has no pretrained weights of {name}. With internet access they are downloaded; "
+        "otherwise copy them there, pass --weights FILE, or train with --pretrained False."
+    )
 
 
 def combine_obstacles(obstacles: Sequence[PlacewiseError]) -> PlacewiseError:

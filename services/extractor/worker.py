@@ -124,7 +124,7 @@ class ExtractorWorker:
             self.context.models.extractor(settings.new_map_extractor)
         except PlacewiseError as error:
             # Not fatal: maps may use another extractor, and jobs that need this one report it.
-            log.error("the extractor of new maps can't be loaded: %s", error.detail)
+            log.error("the extractor of new maps can't be loaded: %s: %s", error.code, error.detail)
         if self._only_worker:
             reindex_outdated_generations(self.context.catalog, self.context.models)
 

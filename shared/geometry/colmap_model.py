@@ -165,6 +165,8 @@ def read_colmap_model(folder: Path) -> ColmapModel:
 
 
 def _read_limited(path: Path) -> bytes:
+    if not path.is_file():  # a FIFO would wait for a writer, and /dev/zero has no end
+        raise ValueError(f"{path.name} is missing, or no regular file")
     if path.stat().st_size > MAX_FILE_BYTES:
         raise ValueError(f"{path.name} has more than {MAX_FILE_BYTES} bytes")
     return path.read_bytes()

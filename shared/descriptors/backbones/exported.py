@@ -155,7 +155,7 @@ def exported_prefix(path: Path, filename: str) -> str | None:
         return ONNX_PREFIX
     try:
         records = torch._C.PyTorchFileReader(str(path)).get_all_records()
-    except RuntimeError:
+    except (RuntimeError, ValueError):  # ValueError: names that are not UTF-8
         return None  # not an archive of PyTorch
     return TORCHSCRIPT_PREFIX if "constants.pkl" in records else None
 
