@@ -88,7 +88,7 @@ class OnnxProcess:
         future = self._pool.schedule(function, args=args, timeout=PASS_SECONDS)
         while not wait([future], POLL_SECONDS).done:
             if self._is_stopping():
-                future.cancel()
+                future.cancel()  # type: ignore[no-untyped-call]
                 raise Unavailable(
                     "extractor_stopping", "The extractor stops. The job will be retried."
                 )
