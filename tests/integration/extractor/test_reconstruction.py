@@ -285,9 +285,9 @@ def test_components_are_not_made_again_by_a_job_that_has_stored_them(
 
     calibrate = ReconstructionJob._finish
     monkeypatch.setattr(ReconstructionJob, "_finish", look)
+    job_id = walk.start()
     with service.catalog.write() as session:
-        first = session.get_one(Job, walk.start())
-        first.attempts = 2
+        session.get_one(Job, job_id).attempts = 2
     walk.run()
     assert attempts == [0], "workers that died in the steps before do not count"
     made = walk.current()
