@@ -33,6 +33,8 @@ class ExtractorContext:
     settings: Settings
     models: ModelRegistry
     decoders: DecoderPool
+    is_stopping: Callable[[], bool]
+    """Whether the worker is to stop, so that a pass of a network of others is ended."""
 
 
 @dataclass(slots=True)

@@ -60,8 +60,8 @@ def publish(
         for job, row in zip(ready, rows, strict=True):
             context.store.put(query_vector_key(job.id), encode_rows(row[np.newaxis]))
             if features and job.id in features.encoded:
-                file = encode_feature_file(features.rows([job]))
-                context.store.put(query_features_key(job.id), file)
+                key = query_features_key(job.id)
+                context.store.put(key, encode_feature_file(features.rows([job]), key))
     elif ready:
         written = write_chunk(
             context.store,

@@ -87,10 +87,15 @@ class ExtractorWorker:
         self._metrics = ExtractorMetrics(registry or CollectorRegistry())
         self._heartbeat = Heartbeat(settings.heartbeat_file)
         self._only_worker = only_worker
-        load_added = AddedModelLoader(catalog, store, settings).load
+        self._stop = threading.Event()  # replaced by that of the caller, when there are jobs
+
+        def is_stopping() -> bool:
+            return self._stop.is_set()
+
+        load_added = AddedModelLoader(catalog, store, settings, is_stopping).load
         models = ModelRegistry(store, settings, load_added, self._metrics.observe_model_load)
         self.context = ExtractorContext(
-            catalog, store, settings, models, decoders or DecoderPool(settings)
+            catalog, store, settings, models, decoders or DecoderPool(settings), is_stopping
         )
         on_outcome = self._metrics.count_step_outcome
         self.fits = FitWorker(self.context, name, on_outcome, compute_fit)
@@ -119,7 +124,7 @@ class ExtractorWorker:
             self.context.models.extractor(settings.new_map_extractor)
         except PlacewiseError as error:
             # Not fatal: maps may use another extractor, and jobs that need this one report it.
-            log.error("the extractor of new maps can't be loaded: %s", error.detail)
+            log.error("the extractor of new maps can't be loaded: %s: %s", error.code, error.detail)
         if self._only_worker:
             reindex_outdated_generations(self.context.catalog, self.context.models)
 
@@ -128,6 +133,7 @@ class ExtractorWorker:
 
         Fits run in a thread of their own (`fits`).
         """
+        self._stop = stop
         self.warm_up()
         self._runner.run(lambda: self.drain(stop).claimed > 0, stop, wakeups.wait)
 
@@ -144,6 +150,7 @@ class ExtractorWorker:
 
     def drain(self, stop: threading.Event, seconds: float = math.inf) -> DrainStats:
         """Process jobs until none is claimable, `stop` is set, or `seconds` have passed."""
+        self._stop = stop
         stats, until = DrainStats(), time.monotonic() + seconds
 
         def out_of_time() -> bool:

@@ -23,12 +23,6 @@ from shared.jobs import Job, JobKind, JobState
 from shared.search_api.protocol import PointPair, SeenPoint
 
 
-class RequestModel(BaseModel):
-    """A JSON body; unknown fields are refused."""
-
-    model_config = ConfigDict(extra="forbid")
-
-
 class ResponseModel(BaseModel):
     model_config = ConfigDict(frozen=True, from_attributes=True, populate_by_name=True)
 

@@ -8,6 +8,7 @@ was last known to be current.
 
 from __future__ import annotations
 
+import errno
 import logging
 import threading
 import time
@@ -44,6 +45,7 @@ log = logging.getLogger(__name__)
 
 MIN_CODED_BYTES = 64_000_000  # of rows; smaller generations are scanned faster without codes
 
+FULL_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT)
 SYNCED_STATES = (GenerationState.ACTIVE, GenerationState.BUILDING)
 
 
@@ -105,16 +107,19 @@ def sync_snapshot(
     changes = {photo.photo_id: photo for photo in changed}
     loaded: list[LoadedChunk] = []
     missing: list[str] = []
+    disk_full = False
     for chunk in chunks:
         if chunk.id in known:
             loaded.append(_apply_photo_changes(known[chunk.id], changes))
             continue
         if chunk.id not in filter_values:
             missing.append(chunk.object_key)
+            disk_full |= old is not None and old.disk_full
             continue
         try:
             stored = loader.load_rows(chunk)
         except (Unavailable, NotFound, ValueError, OSError) as error:
+            disk_full |= isinstance(error, OSError) and error.errno in FULL_DISK_ERRORS
             unreadable.failed(chunk.object_key, error)
             missing.append(chunk.object_key)
             continue
@@ -136,6 +141,7 @@ def sync_snapshot(
             version=version,
             chunks=tuple(loaded),
             missing=tuple(missing),
+            disk_full=disk_full,
         ),
     )
 

@@ -32,6 +32,8 @@ class Snapshot:
     version: int
     chunks: tuple[LoadedChunk, ...]
     missing: tuple[str, ...] = ()
+    disk_full: bool = False
+    """Whether some are missing only because the disk of the worker's cache is full."""
     parts: tuple[IndexPart, ...] = ()
     """Parts of the index, and whether they are resident or mapped files."""
     gpu: GpuRows | None = None

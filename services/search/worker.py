@@ -84,7 +84,7 @@ class QueryRowReader:
             Unavailable: `chunk_unreadable` if the row's object is damaged.
         """
         chunk = snapshot.by_key.get(request.object_key)
-        if request.object_key in snapshot.missing:
+        if request.object_key in snapshot.missing and not snapshot.disk_full:
             raise _unreadable_error(request.object_key)
         if chunk is None:
             reference = RowReference(object_key=request.object_key, row=request.row)
@@ -294,6 +294,7 @@ class SearchWorker:
             versions=versions,
             incomplete=tuple(key for key, snapshot in snapshots.items() if snapshot.missing),
             missing=tuple(key for snapshot in snapshots.values() for key in snapshot.missing),
+            disk_full=any(snapshot.disk_full for snapshot in snapshots.values()),
             lags=self.replication_lag.current_lags(versions),
             devices=() if self._gpu is None else (self._gpu.status(),),
         )

@@ -12,11 +12,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from shared.errors import InvalidRequest
+from shared.http.request_model import FailFastList, RequestModel
 
 MAX_CAMERAS = 10_000
+MAX_PHOTOS = 50_000
 MAX_NAME_CHARACTERS = 1000
 MAX_FILE_BYTES = 2_000_000_000
 """Of `images.bin`, which also has the keypoints"""
@@ -42,14 +44,16 @@ _POINT_BYTES = 24  # of an image: x, y, number of the point
 Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 
 
-class _Part(BaseModel):
+class _Part(RequestModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class ColmapCamera(_Part):
     """A camera of one of COLMAP's models; lengths in pixels."""
 
-    model: str = Field(description=f"one of {', '.join(PARAMETERS)}")
+    model: str = Field(
+        max_length=MAX_NAME_CHARACTERS, description=f"one of {', '.join(PARAMETERS)}"
+    )
     width: int = Field(ge=1, le=1_000_000)
     height: int = Field(ge=1, le=1_000_000)
     params: list[Number] = Field(description="as COLMAP orders them", max_length=16)
@@ -93,8 +97,8 @@ class ColmapPhoto(_Part):
 class ColmapModel(_Part):
     """Cameras and poses of a COLMAP model."""
 
-    cameras: list[ColmapCamera] = Field(min_length=1, max_length=MAX_CAMERAS)
-    photos: list[ColmapPhoto] = Field(min_length=3)
+    cameras: FailFastList[ColmapCamera] = Field(min_length=1, max_length=MAX_CAMERAS)
+    photos: FailFastList[ColmapPhoto] = Field(min_length=3, max_length=MAX_PHOTOS)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -169,6 +173,8 @@ def read_colmap_model(folder: Path) -> ColmapModel:
 
 
 def _read_limited(path: Path) -> bytes:
+    if not path.is_file():  # a FIFO would wait for a writer, and /dev/zero has no end
+        raise ValueError(f"{path.name} is missing, or no regular file")
     if path.stat().st_size > MAX_FILE_BYTES:
         raise ValueError(f"{path.name} has more than {MAX_FILE_BYTES} bytes")
     return path.read_bytes()

@@ -235,7 +235,7 @@ class JobRunner:
                 )
             except PlacewiseError as error:
                 outcome, refusal = StepOutcome.FAILED, error.as_problem()
-                log.error("%s: %s", jobs, error.detail)
+                log.error("%s: %s: %s", jobs, error.code, error.detail)
                 updated = self._update(
                     claimed, lambda session, job: _fail_or_requeue(session, job, refusal)
                 )

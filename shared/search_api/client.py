@@ -105,6 +105,7 @@ def merge_statuses(
         versions={key: min(status.versions[key] for status in statuses) for key in common},
         incomplete=tuple(sorted({key for status in statuses for key in status.incomplete})),
         missing=tuple(key for status in statuses for key in status.missing),
+        disk_full=any(status.disk_full for status in statuses),
         lags={
             key: max(
                 (status.lags[key] for status in statuses if key in status.lags),

@@ -169,6 +169,8 @@ class SearchStatus(_Message):
     """Generations with an unreadable chunk."""
     missing: tuple[str, ...]
     """Object keys of unreadable chunks."""
+    disk_full: bool = False
+    """Whether some are unreadable only because a worker's cache is on a full disk."""
     lags: dict[UUID, ReplicationLag] = {}
     """Replication lag by generation; empty for a worker that does not follow the catalog."""
     devices: tuple[DeviceStatus, ...] = ()

@@ -41,8 +41,10 @@ from shared.descriptors.vocabulary_file import (
 )
 from shared.errors import InvalidRequest, Misconfigured, PlacewiseError, Unprocessable
 from shared.extractor_config.configs import ExtractorConfig
+from shared.extractor_config.names import TORCHSCRIPT_PREFIX
 from shared.imaging.decode import DecodedPhoto
 from shared.imaging.preprocessing import Pixels, Preprocessing
+from shared.storage.copying import hash_file
 from shared.storage.open_store import open_store
 
 
@@ -50,7 +52,7 @@ def load_extractor(config: ExtractorConfig, settings: Settings) -> Extractor:
     """Load an extractor on the device and in the precision of the settings.
 
     Raises:
-        Misconfigured: The weights are missing or don't fit; `model_missing`.
+        Misconfigured: The weights are missing or don't fit; `model_missing`, `code_not_allowed`.
     """
     if config.parts:
         return SideBySideExtractor(config, [load_extractor(p, settings) for p in config.parts])
@@ -67,8 +69,16 @@ def load_extractor(config: ExtractorConfig, settings: Settings) -> Extractor:
 def _added_backbone(
     config: ExtractorConfig, settings: Settings, device: torch.device
 ) -> Backbone | None:
-    """Load an added model from the catalog and store, which may be in use; None for others."""
-    if config.model is None or config.model.registered is None:
+    """Load an added model from the catalog and store, which may be in use; None for others.
+
+    Raises Misconfigured (`code_not_allowed`) for any TorchScript file that CODE_ALLOWED lacks.
+    """
+    if config.model is None:
+        return None
+    if config.model.file is not None and config.model.prefix == TORCHSCRIPT_PREFIX:
+        with open_file(Path(config.model.file)) as file:
+            settings.check_torchscript_allowed(config.model.extractor, hash_file(file)[1])
+    if config.model.registered is None:
         return None
     name, prefix = config.model.registered, config.model.prefix
     catalog_file = settings.placewise_home / "catalog.sqlite"

@@ -6,6 +6,7 @@ and for the vocabulary fit that the server starts if the map has enough photos.
 
 from __future__ import annotations
 
+import functools
 import json
 import time
 from collections import Counter, deque
@@ -239,8 +240,15 @@ def wait_until_described(client: Client, job_id: str | UUID) -> Job:
     """Wait until the photo's job ends, or waits for a vocabulary; return it."""
     job = client.job(job_id)  # at once: thousands of jobs may wait for a vocabulary
     while not job.finished and not job.waiting_for:
+        if job.error is not None:  # it is retried until an operator has removed the cause
+            _note_once(f"The photos wait: {job.error['code']}: {job.failure}")
         job = client.job(job_id, POLL_SECONDS)
     return job
+
+
+@functools.cache
+def _note_once(message: str) -> None:
+    print_note(message)
 
 
 def _photo_failure(photo: LocalPhoto, reason: str) -> Json:

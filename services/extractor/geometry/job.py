@@ -219,7 +219,8 @@ class ReconstructionJob:
         if known is not None:
             matches = _join_matches(matches, known)
         self._store.put(key, matches.encode())
-        self._end_step()
+        with self._catalog.write() as session:
+            self._end_step(session)
         return matches
 
     def _read_sections(self, photos: dict[UUID, MapPhoto]) -> list[str | None]:
@@ -292,7 +293,7 @@ class ReconstructionJob:
                 self._store_component(made.id, number, each) for number, each in enumerate(found)
             ]
         with self._catalog.write() as session:
-            self._lock(session)
+            self._end_step(session)
             made = session.get_one(Reconstruction, made.id)
             made.components = [each.model_dump(mode="json") for each in stored]
         return made, [each.component for each in found]
@@ -438,10 +439,9 @@ class ReconstructionJob:
             calibrate_components, parts, matcher, on_progress=report, check=self._progress.check
         )
 
-    def _end_step(self) -> None:
+    def _end_step(self, session: Session) -> None:
         """Note that a step is stored: workers that died before it do not count any more."""
-        with self._catalog.write() as session:
-            self._lock(session).attempts = 0
+        self._lock(session).attempts = 0
 
     def _lock(self, session: Session) -> Job:
         leased = lock_leased_job(session, self._job)

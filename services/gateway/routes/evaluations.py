@@ -19,7 +19,8 @@ from services.gateway.admission import ADMIT_JOB
 from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import GatewayDep, GenerationId, MapQuery, PageQuery
 from services.gateway.idempotency import IdempotentDep
-from services.gateway.schemas import JobAcceptedResponse, RequestModel, ResponseModel
+from services.gateway.json_bodies import JsonRoute
+from services.gateway.schemas import JobAcceptedResponse, ResponseModel
 from shared.catalog.chunks import has_geotagged
 from shared.catalog.generations import (
     Generation,
@@ -32,11 +33,12 @@ from shared.catalog.maps import get_map
 from shared.catalog.photos import PhotoRole
 from shared.catalog.vocabularies import word_weights_unavailable_reason
 from shared.errors import Conflict, NotFound
+from shared.http.request_model import RequestModel
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
 from shared.word_weights.record import HeldOut, Outcome, WordWeights, parse_word_weights
 
-router = APIRouter(tags=["evaluations"])
+router = APIRouter(tags=["evaluations"], route_class=JsonRoute)
 
 
 class EvaluationRequest(RequestModel):

@@ -251,7 +251,12 @@ def _check_search(gateway: GatewayContext) -> ComponentStatus:
         problems.append(
             f"{len(status.missing)} chunks can't be read: {named}"
             + (f" and {more} more" if more > 0 else "")
-            + " (repair them with placewise storage verify --repair)"
+            + (
+                " (the cache disk of a search worker is full: free space in its PLACEWISE_HOME; "
+                "the chunks are then loaded)"
+                if status.disk_full
+                else " (repair them with placewise storage verify --repair)"
+            )
         )
     if problems:
         return ComponentStatus(status="degraded", detail="; ".join(problems))

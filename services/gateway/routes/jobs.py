@@ -44,8 +44,8 @@ HEARTBEAT_SECONDS = 15.0  # interval of comment lines, so that proxies do not cl
 
 
 class JobsParams(MapPageParams):
-    state: list[JobState] | None = None
-    kind: list[JobKind] | None = None
+    state: list[JobState] | None = Field(None, max_length=len(JobState))
+    kind: list[JobKind] | None = Field(None, max_length=len(JobKind))
 
 
 @router.get("/jobs", operation_id="list_jobs", dependencies=[READ])

@@ -14,10 +14,10 @@ from services.gateway.admission import ADMIT_JOB, AdmissionDep, UploadKind
 from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import NO_NUL_PATTERN, GatewayContext, GatewayDep, MapQuery
 from services.gateway.idempotency import IdempotentDep, IdempotentFormDep, IdempotentRequest
+from services.gateway.json_bodies import JsonRoute
 from services.gateway.schemas import (
     GenerationResponse,
     JobAcceptedResponse,
-    RequestModel,
     VocabularyResponse,
 )
 from services.gateway.uploads.multipart import FormFile, multipart_schema, receive_form_file
@@ -35,12 +35,13 @@ from shared.extractor_config.configs import (
     MAX_PCA_DIMENSION,
     ExtractorConfig,
 )
+from shared.http.request_model import RequestModel
 from shared.jobs import Job, JobKind
 from shared.jobs.model_changes import start_model_change
 from shared.storage.keys import new_vocabulary_key
 from shared.storage.vocabulary_npz import encode_vocabulary_file
 
-router = APIRouter(tags=["model changes"])
+router = APIRouter(tags=["model changes"], route_class=JsonRoute)
 
 MAX_VOCABULARY_BYTES = 64_000_000
 

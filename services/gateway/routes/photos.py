@@ -27,6 +27,7 @@ from services.gateway.dependencies import (
     PageParams,
     invalid_cursor_error,
 )
+from services.gateway.json_bodies import JsonRoute
 from services.gateway.photo_search import MAX_COUNTED_MATCHES, MetadataFilter, search_photos
 from services.gateway.schemas import (
     DeletedPhotoResponse,
@@ -34,7 +35,6 @@ from services.gateway.schemas import (
     MetadataSearchResponse,
     PhotoDetailResponse,
     PhotoResponse,
-    RequestModel,
 )
 from services.gateway.similarity.search_params import (
     FilterParams,
@@ -46,9 +46,14 @@ from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import get_map, increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole, get_photo, mark_photo_deleted
 from shared.errors import NotFound, invalid_field_error
+from shared.http.request_model import RequestModel
 from shared.imaging.file_formats import needs_preview
 from shared.imaging.photo_header import MAX_ALTITUDE_M
 from shared.ingest.photo_metadata import (
+    MAX_METADATA_FIELDS,
+    MAX_PATH_CHARACTERS,
+    MAX_TAGS,
+    MAX_TEXT_CHARACTERS,
     check_coordinate_pair,
     check_metadata,
     parse_relative_path,
@@ -59,7 +64,7 @@ from shared.jobs import Job, JobKind, JobState, Priority
 from shared.jobs.transitions import cancel_jobs, requeue_job_as_new
 from shared.storage.keys import preview_key, thumbnail_key
 
-router = APIRouter(tags=["photos"])
+router = APIRouter(tags=["photos"], route_class=JsonRoute)
 
 STREAM_READ_BYTES = 256 * 1024
 IMAGE_RESPONSE: dict[int | str, dict[str, Any]] = {
@@ -75,6 +80,9 @@ def read_photo(gateway: GatewayDep, file_id: FileId, query: MapQuery) -> PhotoDe
         return _photo_detail_response(session, photo, query.map)
 
 
+Label = Annotated[str, Field(max_length=MAX_TEXT_CHARACTERS, pattern=NO_NUL_PATTERN)]
+
+
 class PhotoUpdate(RequestModel):
     """Fields to update: omitted fields are unchanged, null clears a field."""
 
@@ -84,13 +92,16 @@ class PhotoUpdate(RequestModel):
         float | None, Field(ge=-MAX_ALTITUDE_M, le=MAX_ALTITUDE_M, allow_inf_nan=False)
     ] = None
     heading: Annotated[float | None, Field(ge=0, le=360, allow_inf_nan=False)] = None
-    captured_at: str | None = None
-    place: Annotated[str | None, Field(max_length=500, pattern=NO_NUL_PATTERN)] = None
-    tags: list[Annotated[str, Field(pattern=NO_NUL_PATTERN)]] | None = None
-    metadata: dict[str, Any] | None = None
+    captured_at: Annotated[str | None, Field(max_length=100)] = None
+    place: Label | None = None
+    tags: Annotated[list[Label] | None, Field(max_length=MAX_TAGS)] = None
+    metadata: Annotated[dict[str, Any] | None, Field(max_length=MAX_METADATA_FIELDS)] = None
     role: PhotoRole | None = None
-    relative_path: Annotated[str | None, Field(max_length=1000, pattern=NO_NUL_PATTERN)] = Field(
-        None, description="path in its folder or archive, such as Day 2/IMG_2078.jpg"
+    relative_path: str | None = Field(
+        None,
+        max_length=MAX_PATH_CHARACTERS,
+        pattern=NO_NUL_PATTERN,
+        description="path in its folder or archive, such as Day 2/IMG_2078.jpg",
     )
 
     def to_columns(self) -> dict[str, Any]:

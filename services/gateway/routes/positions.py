@@ -10,7 +10,8 @@ from pydantic import AwareDatetime, ConfigDict, Field, model_validator
 
 from services.gateway.authentication import READ
 from services.gateway.dependencies import NO_PARAMETERS, GatewayDep, MapQuery
-from services.gateway.schemas import RequestModel, ResponseModel
+from services.gateway.json_bodies import JsonRoute
+from services.gateway.schemas import ResponseModel
 from shared.catalog.chunks import count_searchable
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
@@ -25,10 +26,11 @@ from shared.geotagging.evidence import (
     interpolate_position,
 )
 from shared.geotagging.fusion import propose_position
+from shared.http.request_model import FailFastList, RequestModel
 from shared.imaging.photo_header import read_photo_header
 from shared.tracks.motion import motion_model
 
-router = APIRouter(tags=["photos"])
+router = APIRouter(tags=["photos"], route_class=JsonRoute)
 
 MAX_NAME = 1000
 MAX_UNLOCATED = 100
@@ -124,12 +126,12 @@ class TrackPointBody(_Finite):
 class PositionsBody(_Finite):
     """The photos of a folder."""
 
-    photos: list[DatedPhotoBody] = Field(
+    photos: FailFastList[DatedPhotoBody] = Field(
         max_length=10_000,
         description=f"at most {MAX_UNLOCATED} of them without coordinates; the others show where "
         "their camera was",
     )
-    track: list[TrackPointBody] = Field(
+    track: FailFastList[TrackPointBody] = Field(
         default=[], max_length=10_000, description="points of a GPX track"
     )
     radius_m: float = Field(100.0, ge=10, le=2000, description="radius of the proposals")

@@ -38,6 +38,7 @@ from services.gateway.dependencies import (
     UploadId,
 )
 from services.gateway.idempotency import IdempotentDep, IdempotentReplay, delete_if_refused
+from services.gateway.json_bodies import JsonRoute
 from services.gateway.routes.photos import PhotoUpdate
 from services.gateway.routes.uploads import (
     UPLOAD_RESPONSES,
@@ -64,7 +65,7 @@ from shared.ingest.validation import (
 from shared.storage import ObjectInfo, PresigningStore
 from shared.storage.keys import incoming_key, new_original_key
 
-router = APIRouter(tags=["photos"])
+router = APIRouter(tags=["photos"], route_class=JsonRoute)
 
 PRESIGN_SECONDS = 900  # to send and complete an upload: 100 MB at 1 Mbit/s
 FILE_FIELDS = ("filename", "file_size", "sha256")

@@ -37,6 +37,7 @@ from services.gateway.idempotency import (
     IdempotentFormDep,
     IdempotentRequest,
 )
+from services.gateway.json_bodies import JsonRoute
 from services.gateway.schemas import ResponseModel, accepted_headers, job_url, url_in_map
 from services.gateway.similarity.search_params import SearchParams
 from services.gateway.tracks.apply_frames import apply_pending_frames, smooth_states
@@ -70,7 +71,7 @@ from shared.ids import new_id
 from shared.imaging.photo_header import read_photo_header
 from shared.jobs.wakeups import WakeupQueue
 
-router = APIRouter(tags=["tracks"])
+router = APIRouter(tags=["tracks"], route_class=JsonRoute)
 
 APPLY_SECONDS = 5.0  # of one read; frames that remain pending are applied by the next one
 

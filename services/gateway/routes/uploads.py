@@ -25,7 +25,12 @@ from services.gateway.dependencies import (
 )
 from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
 from services.gateway.schemas import UploadResponse, accepted_headers, url_in_map
-from services.gateway.uploads.multipart import FormFile, multipart_schema, receive_form_file
+from services.gateway.uploads.multipart import (
+    MAX_FIELDS_BYTES,
+    FormFile,
+    multipart_schema,
+    receive_form_file,
+)
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.photos import PhotoRole
 from shared.imaging.file_formats import ACCEPTED_PHOTOS, photo_suffix
@@ -37,7 +42,7 @@ from shared.storage.keys import new_original_key
 
 router = APIRouter(tags=["photos"])
 
-_TEXT_SCHEMA = {"type": "string"}
+_TEXT_SCHEMA = {"type": "string", "maxLength": MAX_FIELDS_BYTES}
 UPLOAD_FORM = multipart_schema(
     ACCEPTED_PHOTOS,
     latitude={"type": "number", "minimum": -90, "maximum": 90},

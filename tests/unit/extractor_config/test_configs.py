@@ -271,6 +271,8 @@ def test_two_extractors_side_by_side_have_one_name(written: str, canonical: str)
         ("test-tiny-vlad+test-tiny-vlad", "bad_extractor_option"),
         ("patchnorm+patchnorm+patchnorm", "bad_extractor_option"),
         ("patchnorm@0+test-tiny-avg@1", "bad_extractor_option"),
+        ("onnx:a@0.0001+onnx:b@9999", "bad_extractor_option"),
+        ("onnx:a@9999+onnx:b@1", "bad_extractor_option"),
         ("patchnorm+anyloc-vits14:aggregator=gem,preprocessing=round14", "bad_extractor_option"),
         ("patchnorm+nobody", "unknown_extractor"),
         ("+patchnorm", "bad_extractor_option"),

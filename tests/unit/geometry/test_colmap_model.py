@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import struct
 from pathlib import Path
@@ -172,3 +173,20 @@ def test_damaged_files_are_read_or_refused_and_nothing_else(
     (tmp_path / name).write_bytes(content)
     with contextlib.suppress(InvalidRequest):
         read_colmap_model(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["fifo", "endless device", "folder"])
+def test_what_is_no_regular_file_is_not_read(folder: Path, tmp_path: Path, kind: str) -> None:
+    for name in ("cameras", "images"):
+        model = shutil.copytree(folder, tmp_path / name)
+        file = next(model.glob(f"{name}.*"))
+        file.unlink()
+        if kind == "fifo":
+            os.mkfifo(file)
+        elif kind == "folder":
+            file.mkdir()
+        else:
+            file.symlink_to("/dev/zero")
+        with pytest.raises(InvalidRequest) as caught:
+            read_colmap_model(model)
+        assert caught.value.code == "bad_colmap_model"
