@@ -12,8 +12,6 @@ import logging
 import threading
 import time
 from collections.abc import Collection, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
 from uuid import UUID
 
 import numpy as np
@@ -32,7 +30,7 @@ from services.search.photo_columns import build_row_mask
 from services.search.photo_matcher import PhotoMatcher
 from services.search.pose_estimator import PoseEstimator
 from services.search.query_batcher import QueryBatcher
-from services.search.residency import MemoryBudget, open_search_gpu
+from services.search.residency import MemoryBudget
 from services.search.snapshot import Snapshot
 from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.session import Catalog, ChangePoll
@@ -56,10 +54,6 @@ from shared.storage.chunks import Row, read_row, rows_are_valid
 from shared.storage.keys import QUERIES
 from shared.storage.read_retries import ReadRetries
 from shared.word_weights.weights import apply_word_weights
-
-if TYPE_CHECKING:
-    from services.search.gpu import GpuRows
-
 
 log = logging.getLogger(__name__)
 
@@ -157,7 +151,6 @@ def _unreadable_error(object_key: str) -> Unavailable:
 MAX_WAIT_SECONDS = 5.0  # for `min_version`; half of the time that the gateway gives a shard
 FOLLOW_SECONDS = 1.0  # interval of the polls for changes of the catalog
 VERSION_POLL_SECONDS = 0.01
-MAX_SYNC_COPY_BYTES = 1 << 28  # to a GPU, before a new snapshot is served: a tenth of a second
 FILE_CHECK_SECONDS = 5.0  # interval of the checks whether mapped files were changed
 
 
@@ -176,10 +169,9 @@ class SearchWorker:
         settings: Settings,
         shard: Shard = SINGLE_SHARD,
         *,
-        gpu: GpuRows | None = None,
         max_wait_seconds: float = MAX_WAIT_SECONDS,
     ) -> None:
-        """Create a worker without any snapshot; its GPU is by default as SEARCH_DEVICE says."""
+        """Create a worker without any snapshot."""
         self.shard = shard
         self.replication_lag = ReplicationLagTracker()
         self._catalog = catalog
@@ -194,7 +186,6 @@ class SearchWorker:
         self._snapshots: dict[UUID, Snapshot] = {}
         self._snapshots_lock = threading.Lock()  # never held during I/O
         self._load_locks: dict[UUID, threading.Lock] = {}
-        self._gpu = gpu or open_search_gpu(settings.search_device)
         self._unreadable = ReadRetries()
         self._files_due: dict[UUID, float] = {}  # next check of each generation's files
 
@@ -239,14 +230,10 @@ class SearchWorker:
                 self._sync_generation(generation_id, target.version)
             elif self._needs_reload(snapshot):
                 self._sync_generation(generation_id, target.version, damaged=snapshot)
-            if self._gpu is not None and (new := self._snapshots.get(generation_id)):
-                self._gpu.load(new)
             self.replication_lag.record_synced(generation_id, read_at)
         ended = held - current.keys()
         for generation_id in ended:
             self._memory_budget.release_generation(generation_id)
-        if self._gpu is not None:
-            self._gpu.release(ended)
         with self._snapshots_lock:
             self._snapshots = {k: v for k, v in self._snapshots.items() if k not in ended}
             known = {*current, *self._snapshots}
@@ -295,7 +282,6 @@ class SearchWorker:
             incomplete=tuple(key for key, snapshot in snapshots.items() if snapshot.missing),
             missing=tuple(key for snapshot in snapshots.values() for key in snapshot.missing),
             lags=self.replication_lag.current_lags(versions),
-            devices=() if self._gpu is None else (self._gpu.status(),),
         )
 
     def snapshot(self, generation_id: UUID, min_version: int) -> Snapshot:
@@ -344,9 +330,6 @@ class SearchWorker:
                 self.shard,
             )
             if new is not None:
-                if self._gpu is not None:
-                    self._gpu.load(new, MAX_SYNC_COPY_BYTES)
-                    new = replace(new, gpu=self._gpu)
                 with self._snapshots_lock:
                     self._snapshots = {**self._snapshots, generation_id: new}
             return new

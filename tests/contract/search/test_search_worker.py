@@ -1,4 +1,4 @@
-"""The search worker keeps the contract with each method: dense, sign codes, GPU."""
+"""The search worker keeps the contract with each method: dense and sign codes."""
 
 from __future__ import annotations
 
@@ -7,13 +7,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import pytest
-import torch
 
-from services.search import executor
 from services.search import worker as worker_module
 from services.search.catalog_sync import read_generation_versions
-from services.search.gpu import GpuRows
-from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, RowType
@@ -240,47 +236,3 @@ class TestSearchWorkerOfFloat16RowsByCodes(TestSearchWorkerOfFloat16Rows):
     @pytest.fixture(autouse=True)
     def by_codes(self, monkeypatch: pytest.MonkeyPatch) -> None:
         always_by_codes(monkeypatch)
-
-
-@whatever_the_catalog
-class TestSearchWorkerOnADevice(TestSearchWorker):
-    """The same promises where the rows lie on a device: PyTorch's CPU stands for a GPU."""
-
-    certificate = "exhaustive"
-
-    @pytest.fixture
-    def port(
-        self,
-        catalog: Catalog,
-        store: FolderStore,
-        settings: Settings,
-        monkeypatch: pytest.MonkeyPatch,
-    ) -> OpenPort:
-        monkeypatch.setattr(executor, "sign_codes_pay_off", lambda selected, k: selected > 0)
-
-        def open_port(**options: Any) -> SearchBackend:
-            rows = GpuRows(torch.device("cpu"))
-            worker = SearchWorker(catalog, store, settings, gpu=rows, **options)
-            worker.sync()
-            return worker
-
-        return open_port
-
-    def test_status_and_metrics_have_what_lies_on_the_device(
-        self, places: SmallMap, port: OpenPort
-    ) -> None:
-        places.add(unit_rows(1, 40))
-        search = port()
-        assert isinstance(search, SearchWorker)
-        (device,) = search.status().devices
-        assert device.name == "cpu"
-        assert list(device.generations) == [places.generation_id]
-        before = device.resident_bytes
-        text = MeteredSearch(search).render().decode()
-        assert f'placewise_search_device_resident_bytes{{device="cpu"}} {before:.1f}' in text
-        assert 'placewise_search_device_failed{device="cpu"} 0.0' in text
-        places.add(unit_rows(2, 40))
-        search.search(places.request(places.query(unit_rows(3, 1)[0])))
-        (device,) = search.status().devices
-        assert device.resident_bytes == 2 * before, "a new chunk is on the device at once"
-        assert device.failure is None
