@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import os
+import threading
 from typing import Any, BinaryIO
 
 import numpy as np
 import pytest
 
 from services.search import worker as worker_module
-from services.search.catalog_sync import read_generation_versions
+from services.search.catalog_sync import read_generation_versions, sync_snapshot
+from services.search.snapshot import Snapshot
 from services.search.worker import SearchWorker
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, RowType
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD
+from shared.errors import Unavailable
 from shared.search_api.protocol import SearchBackend
 from shared.storage import FolderStore, read_retries
 from shared.storage.chunks import decode_rows
@@ -141,7 +144,7 @@ def test_what_another_thread_loads_while_the_worker_syncs_stays_loaded(
     always_by_codes(monkeypatch)  # with cached files
     places = SmallMap(catalog, store)
     places.add(unit_rows(1, 30))
-    worker = SearchWorker(catalog, store, settings)
+    worker = SearchWorker(catalog, store, settings, max_wait_seconds=60)  # the kernels compile
     others: list[SmallMap] = []
 
     def read_before_another_map_is_searched(catalog: Catalog) -> Any:
@@ -166,6 +169,32 @@ def test_what_another_thread_loads_while_the_worker_syncs_stays_loaded(
     worker.sync()
     assert worker.status().versions.keys() == {places.generation_id}
     assert [folder.name for folder in cached.iterdir()] == [str(places.generation_id)]
+
+
+def test_queries_wait_for_one_slow_load_no_longer_than_their_deadline(
+    places: SmallMap, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places.add(unit_rows(1, 5))
+    request = places.request(places.query(unit_rows(2, 1)[0]))
+    worker = SearchWorker(places.catalog, places.store, settings, max_wait_seconds=0.1)
+    goes_on, loads = threading.Event(), 0
+
+    def load_slowly(*arguments: Any) -> Snapshot | None:
+        nonlocal loads
+        loads += 1
+        goes_on.wait(60)
+        return sync_snapshot(*arguments)
+
+    monkeypatch.setattr(worker_module, "sync_snapshot", load_slowly)
+    for _ in range(3):
+        with pytest.raises(Unavailable) as refused:
+            worker.search(request)
+        assert refused.value.code == "search_behind"
+    assert loads == 1
+    goes_on.set()
+    worker.sync()
+    assert len(worker.search(request).hits) == 5
+    assert loads == 1, "what was loaded for the refused queries is used"
 
 
 @whatever_the_catalog
