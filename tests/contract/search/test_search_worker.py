@@ -33,7 +33,8 @@ from tests.support.small_map import SmallMap, assert_answers, damaged, unit_rows
 @pytest.fixture
 def port(catalog: Catalog, store: FolderStore, settings: Settings) -> OpenPort:
     def open_port(**options: Any) -> SearchBackend:
-        return SearchWorker(catalog, store, settings, **options)
+        # The first query of a process may wait until kernels are compiled.
+        return SearchWorker(catalog, store, settings, **{"max_wait_seconds": 60.0, **options})
 
     return open_port
 
