@@ -2,8 +2,8 @@
 
 Products in float32 rule out the rows that cannot be in the result, whatever the rounding of their
 sums; the others are compared in float64. The rows are read as they are stored, by a compiled kernel
-on all CPUs: BLAS and faiss multiply float32 only, which takes three times the memory beside float16
-rows, and reads twice the bytes.
+on all CPUs: BLAS and faiss multiply float32 only. A copy for them takes twice the memory of float16
+rows, and twice the bytes have to be read.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from services.search.snapshot import Snapshot
+from shared.storage.chunks import NORM_TOLERANCE
 
 # NumPy converts as many float16 numbers in 2 ms. It is used up to this size of a snapshot, because
 # importing and compiling the kernel takes a second.
 NUMPY_NUMBERS = 1_000_000
 
 ROUNDING = 2.0**-24  # relative error of a float32 operation
-LONGEST_ROW = 1.001  # rows are of length 1, apart from the rounding of their numbers to float16
 
 QueryRow = NDArray[np.float32]
 RowNumbers = NDArray[np.int64]
@@ -67,10 +67,10 @@ def float32_error(dimension: int) -> float:
 
     N. J. Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.1: the error of
     a product of n numbers is at most n u / (1 - n u) times the lengths of the two vectors. One more
-    rounding is that of the query's numbers.
+    rounding is that of the query's numbers. Rows are as long as `rows_are_valid` permits.
     """
     roundings = (dimension + 1) * ROUNDING
-    return LONGEST_ROW * roundings / (1 - roundings)
+    return (1 + NORM_TOLERANCE) * roundings / (1 - roundings)
 
 
 def compile_kernel(snapshot: Snapshot) -> None:
@@ -103,15 +103,17 @@ def _multiply(
     snapshot: Snapshot, rows: RowNumbers, query: QueryRow, kind: DTypeLike
 ) -> NDArray[Any]:
     """Return the products of the given rows with the query, summed in this type."""
+    products = np.empty(len(rows), kind)
     if _uses_kernel(snapshot):
-        products = np.empty(len(rows), kind)
         snapshot.row_blocks.multiply(rows, query, products)
         return products
-    if not len(rows):
-        return np.empty(0, kind)
-    stored = np.stack([snapshot.chunks[c].rows[row] for c, row in snapshot.photos.locate(rows)])
-    found: NDArray[Any] = np.vecdot(stored.astype(kind), query.astype(kind))
-    return found
+    firsts = snapshot.photos.first_rows
+    of_chunk = np.searchsorted(firsts, rows, side="right") - 1
+    for chunk in np.unique(of_chunk).tolist():
+        here = of_chunk == chunk
+        stored = snapshot.chunks[chunk].rows[rows[here] - firsts[chunk]]
+        products[here] = np.vecdot(stored.astype(kind), query.astype(kind))
+    return products
 
 
 def _length(query: QueryRow) -> np.float64:
