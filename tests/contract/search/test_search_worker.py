@@ -172,9 +172,11 @@ def test_what_another_thread_loads_while_the_worker_syncs_stays_loaded(
     assert [folder.name for folder in cached.iterdir()] == [str(places.generation_id)]
 
 
+@whatever_the_catalog
 def test_queries_wait_for_one_slow_load_no_longer_than_their_deadline(
-    places: SmallMap, settings: Settings, monkeypatch: pytest.MonkeyPatch
+    catalog: Catalog, store: FolderStore, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    places = SmallMap(catalog, store)
     places.add(unit_rows(1, 5))
     request = places.request(places.query(unit_rows(2, 1)[0]))
     worker = SearchWorker(places.catalog, places.store, settings, max_wait_seconds=0.1)
