@@ -37,9 +37,7 @@ PANELS = {
     "Descriptors and accuracy": {
         "vocabulary": "services.cli.descriptors.vocabulary:app",
         "models": "services.cli.descriptors.models:app",
-        "describe": "services.cli.descriptors.describe:describe",
         "evaluate": "services.cli.evaluate:evaluate",
-        "compare": "services.cli.compare:compare",
     },
     "Services": {
         "serve": "services.cli.operations.servers:serve",
@@ -56,10 +54,10 @@ PANELS = {
     },
 }
 # The lab's commands exist where `lab` stands beside `services`: in a clone of the repository, but
-# in no image. Its `evaluate` and `compare` replace those of the
-# service.
+# in no image. Its `evaluate` adds data sets to that of the service.
 LAB_PANEL = "Descriptors and accuracy"
 LAB_COMMANDS = {
+    "describe": "lab.cli.descriptors.describe:describe",
     "evaluate": "lab.cli.evaluation.commands:evaluate",
     "compare": "lab.cli.evaluation.commands:compare",
     "train": "lab.cli.training.commands:train",

@@ -130,20 +130,17 @@ def sync_snapshot(
     long_rows = any(chunk.rows.shape[1] >= CODED_DIMENSION for chunk in loaded)
     if long_rows and (large or (old is not None and old.has_sign_codes)):
         loaded = _with_codes(loader, loaded)
-    else:
-        compile_kernel(loaded)
     loader.evict_except(loaded)
-    return _apply_memory_budget(
-        memory_budget,
-        Snapshot(
-            generation_id=generation_id,
-            map_id=generation.map_id,
-            version=version,
-            chunks=tuple(loaded),
-            missing=tuple(missing),
-            disk_full=disk_full,
-        ),
+    snapshot = Snapshot(
+        generation_id=generation_id,
+        map_id=generation.map_id,
+        version=version,
+        chunks=tuple(loaded),
+        missing=tuple(missing),
+        disk_full=disk_full,
     )
+    compile_kernel(snapshot)
+    return _apply_memory_budget(memory_budget, snapshot)
 
 
 def _apply_memory_budget(memory_budget: MemoryBudget, snapshot: Snapshot) -> Snapshot:

@@ -1,12 +1,13 @@
 """Query executor: runs a query on a snapshot with the cheapest suitable search strategy.
 
-The strategies are the dense scan, sign codes and the GPU. All compare the best candidates exactly
+The strategies are the dense scan and sign codes. Both compare the best candidates exactly
 and rank by float64 cosines; they differ in the certificate of the result.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from uuid import UUID
 
 import numpy as np
@@ -78,8 +79,8 @@ def execute_query(
         weighted_query: If given, rows are ranked by their similarity to it. Hits also carry the
             plain cosine, and `options.min_score` applies to that.
     """
-    selected = int(np.count_nonzero(row_mask))
     plain = _Query(snapshot, query, row_mask, options, batcher)
+    selected = plain.selected
     if not selected or not query.any():
         return plain.to_response([], _ScoredRows(NO_ROWS, NO_SCORES, EXHAUSTIVE, 0))
     if weighted_query is None:
@@ -97,7 +98,7 @@ def execute_query(
     scored = weighted.score_rows()
     ranked = weighted.rank_photos(scored)
     plain_scores = _round_scores(
-        exact_scores(snapshot.chunks, query, np.array([row for _, row, _ in ranked]))
+        exact_scores(snapshot, query, np.array([row for _, row, _ in ranked]))
     )
     hits = [
         SearchHit(photo_id=photo_id, score=score, weighted_score=weighted_score)
@@ -114,7 +115,7 @@ def sign_codes_pay_off(selected: int, k: int) -> bool:
     return selected > 64 + 4 * k
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class _Query:
     """A query of a snapshot, and the strategies that score its rows."""
 
@@ -126,13 +127,15 @@ class _Query:
 
     def score_rows(self) -> _ScoredRows:
         """Score the rows with the cheapest suitable strategy."""
-        snapshot, options, selected = self.snapshot, self.options, self._selected()
-        if options.mode == Mode.AUTO and sign_codes_pay_off(selected, options.k):
-            coded = snapshot.has_sign_codes
-            scored = self._search_by_sign_codes() if coded else self._search_on_gpu()
-            if scored is not None:
-                return scored
-        rows, scores = scan_top_k(snapshot.chunks, self.vector, options.k, self.row_mask)
+        snapshot, options, selected = self.snapshot, self.options, self.selected
+        if (
+            options.mode == Mode.AUTO
+            and snapshot.has_sign_codes
+            and sign_codes_pay_off(selected, options.k)
+            and (scored := self._search_by_sign_codes()) is not None
+        ):
+            return scored
+        rows, scores = scan_top_k(snapshot, self.vector, options.k, self.row_mask)
         return _ScoredRows(rows, scores, EXHAUSTIVE, selected)
 
     def mask_min_score(self) -> NDArray[np.bool_]:
@@ -150,9 +153,7 @@ class _Query:
         if scored is not None:
             rows, scores = scored.rows, scored.scores
         else:
-            rows, scores = scan_min_score(
-                self.snapshot.chunks, self.vector, min_score, self.row_mask
-            )
+            rows, scores = scan_min_score(self.snapshot, self.vector, min_score, self.row_mask)
         passing = np.zeros(number, bool)
         passing[rows[_round_scores(scores) >= min_score]] = True
         return passing
@@ -189,17 +190,6 @@ class _Query:
             missing=missing,
         )
 
-    def _search_on_gpu(self) -> _ScoredRows | None:
-        """Search on the GPU; None if the snapshot is not loaded there, or the GPU fails."""
-        snapshot, k, min_score = self.snapshot, self.options.k, self.options.min_score
-        if snapshot.gpu is None:
-            return None
-        rows = snapshot.gpu.find_candidates(snapshot, self.vector, self.row_mask, k, min_score)
-        if rows is None:
-            return None
-        scores = exact_scores(snapshot.chunks, self.vector, rows)
-        return _ScoredRows(rows, scores, EXHAUSTIVE, self._selected())
-
     def _search_by_sign_codes(self) -> _ScoredRows | None:
         """Search by sign codes; None if an error of an estimate is larger than chance explains."""
         from services.search.sign_code_search import SignCodedQuery, SignCodeSearch
@@ -217,10 +207,12 @@ class _Query:
             return None
         return _ScoredRows(result.rows, result.scores, STATISTICAL, result.scanned, result.max_z)
 
-    def _selected(self) -> int:
+    @cached_property
+    def selected(self) -> int:
+        """Number of rows that may be returned."""
         return int(np.count_nonzero(self.row_mask))
 
 
 def _round_scores(scores: Scores) -> Scores:
     # Clipped, because a computed cosine may exceed 1 slightly.
-    return np.clip(np.round(scores, SCORE_DECIMALS), -1.0, 1.0)
+    return scores.round(SCORE_DECIMALS).clip(-1.0, 1.0)

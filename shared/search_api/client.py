@@ -113,7 +113,6 @@ def merge_statuses(
             )
             for key in lagging
         },
-        devices=tuple(device for status in statuses for device in status.devices),
         unavailable=tuple(shard.name for shard in sorted(unreachable)),
     )
 

@@ -139,18 +139,6 @@ class LoadedGeneration(_Message):
     parts: tuple[IndexPart, ...]
 
 
-class DeviceStatus(_Message):
-    """A GPU that a worker searches on."""
-
-    name: str
-    resident_bytes: int
-    """Bytes of descriptors in the GPU's memory."""
-    generations: tuple[UUID, ...]
-    """Generations searched on the GPU; the others are searched on the CPU."""
-    failure: str | None = None
-    """Last error, after which the CPU searches until the next attempt; None if there is none."""
-
-
 class SearchStatus(_Message):
     """State of a worker: rows and bytes in memory, and the loaded version of each generation.
 
@@ -173,8 +161,6 @@ class SearchStatus(_Message):
     """Whether some are unreadable only because a worker's cache is on a full disk."""
     lags: dict[UUID, ReplicationLag] = {}
     """Replication lag by generation; empty for a worker that does not follow the catalog."""
-    devices: tuple[DeviceStatus, ...] = ()
-    """GPUs in use; empty where the CPU searches everything."""
     unavailable: tuple[str, ...] = ()
     """Shards without an answering worker, as `SearchResponse.missing` names them."""
 

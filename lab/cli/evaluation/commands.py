@@ -15,12 +15,6 @@ from typing import Annotated, Any
 
 import typer
 
-from services.cli.compare import (
-    DEFAULT_PHOTOS,
-    ExtractorOption,
-    PhotosOption,
-    WeightsOption,
-)
 from services.cli.environment import require_packages
 from services.cli.evaluate import SampleOption, SeedOption, WordWeightsOption, evaluate_map
 from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption
@@ -354,9 +348,23 @@ def compare(
         Path | None, typer.Option(help="Output folder for comparison.json and report.html.")
     ] = None,
     faiss_gpu: FaissGpuOption = False,
-    extractor: ExtractorOption = None,
-    photos: PhotosOption = DEFAULT_PHOTOS,
-    weights: WeightsOption = False,
+    extractor: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--extractor",
+            metavar="NAME",
+            help="Map: another extractor, such as A+B or torchscript:/PATH. Can be repeated.",
+        ),
+    ] = None,
+    photos: Annotated[
+        int, typer.Option("--photos", min=20, help="Map: number of photos that are described.")
+    ] = 1000,
+    weights: Annotated[
+        bool,
+        typer.Option(
+            "--weights", help="Map: choose the weights of each A+B on the map's own photos."
+        ),
+    ] = False,
     map_name: MapOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -368,7 +376,7 @@ def compare(
     # Must be set before torch is loaded below; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if data is None:
-        from services.cli.descriptors.compare_on_map import compare_on_map
+        from lab.cli.evaluation.compare_on_map import compare_on_map
 
         compare_on_map(map_name, extractor, photos, weights, as_json)
         return

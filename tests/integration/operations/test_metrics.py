@@ -90,8 +90,6 @@ def test_alerts_and_dashboards_name_only_what_the_services_export(
         "placewise_search_snapshot_version": {"generation"},
         "placewise_search_snapshot_lag_seconds": {"generation"},
         "placewise_search_snapshot_lag_versions": {"generation"},
-        "placewise_search_device_resident_bytes": {"device"},
-        "placewise_search_device_failed": {"device"},
         "placewise_extractor_device_used_bytes": {"device"},
         "placewise_extractor_device_total_bytes": {"device"},
         "placewise_steward_task_lag_seconds": {"task"},

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from services.cli.descriptors.compare_on_map import Described, MapComparison
+from lab.cli.evaluation.compare_on_map import Described, MapComparison
 from tests.integration.in_process_api import Service
 
 pytestmark = pytest.mark.databases("sqlite")

@@ -1,7 +1,6 @@
 """Fits on local files without a server: VLAD vocabularies and PCA whitenings. Imports torch.
 
-Used by `placewise vocabulary fit DIR` and `placewise models fit-pca`, which import this
-module only when they need it.
+`placewise vocabulary fit DIR` and `placewise models fit-pca` load this module by its name.
 """
 
 from __future__ import annotations
@@ -13,12 +12,9 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from services.cli.descriptors.local_extractor import (
-    decode_pixels,
-    load_extractor,
-    load_own_vocabulary,
-    resolve_centres,
-)
+from lab.cli.descriptors.extractors import load_own_vocabulary, photo_decoder, resolve_centres
+from lab.training.describing import Refused
+from services.cli.descriptors.load_extractor import load_extractor
 from services.cli.environment import read_settings
 from services.cli.ingest.geotags import list_photos
 from services.cli.output import (
@@ -34,7 +30,7 @@ from shared.descriptors.patches import fit_vocabulary, sample_photos
 from shared.descriptors.pca_fit import check_pca_fittable, fit_pca_stream, sample_rows, sample_size
 from shared.descriptors.pca_whitening import PcaWhiteningFile, Rows
 from shared.descriptors.vocabulary import ClusterCentres
-from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
+from shared.errors import InvalidRequest, Unprocessable
 from shared.extractor_config.configs import DEFAULT_SAMPLE_PHOTOS, get_extractor_config
 
 
@@ -77,10 +73,10 @@ def fit_vocabulary_on_folder(
         len(all_photos), sample or DEFAULT_SAMPLE_PHOTOS, loaded.backbone.width, seed
     )
     photos = [all_photos[number] for number in numbers]
-    refused: list[tuple[Path, PlacewiseError]] = []
+    refused: Refused = []
     fitted = fit_vocabulary(
         loaded,
-        decode_pixels(photos, loaded.preprocessing, settings, refused),
+        (pixels for _, pixels in photo_decoder(loaded, settings).batches(photos, refused)),
         len(photos),
         clusters=clusters or config.clusters,
         seed=seed,
@@ -126,7 +122,7 @@ def fit_pca_locally(
             vocabulary.
     """
     check_output_path(out, ".safetensors", "a whitening")
-    refused: list[tuple[Path, PlacewiseError]] = []
+    refused: Refused = []
     spec = None
     batches: Iterator[Rows]
     if source.is_dir():
@@ -138,8 +134,8 @@ def fit_pca_locally(
         check_pca_fittable(len(all_photos), dimension, components)
         sampled = sample_rows(len(all_photos), sample_size(dimension, components), SEED)
         photos = [all_photos[number] for number in sampled]
-        pixels = decode_pixels(photos, loaded.preprocessing, settings, refused)
-        batches = (loaded.describe(batch, centres) for batch in pixels)
+        decoded = photo_decoder(loaded, settings).batches(photos, refused)
+        batches = (loaded.describe(pixels, centres) for _, pixels in decoded)
     else:
         if extractor is not None or vocabulary is not None:
             raise InvalidRequest(
@@ -179,7 +175,7 @@ def _load_extractor(
     return loaded, resolve_centres(loaded, own)
 
 
-def _refusals(refused: list[tuple[Path, PlacewiseError]]) -> list[dict[str, str]]:
+def _refusals(refused: Refused) -> list[dict[str, str]]:
     return [{"path": utf8_path(path), "reason": error.detail} for path, error in refused]
 
 

@@ -146,7 +146,7 @@ def describe(
             )
         settings = settings.model_copy(update={"dino_weights": weights.absolute()})
 
-    from services.cli.descriptors.local_extractor import describe_files
+    from lab.cli.descriptors.describe_files import describe_files
 
     with progress_bar() as progress:
         bar = progress.add_task("describing", total=len(photos))

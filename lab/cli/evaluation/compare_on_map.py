@@ -7,7 +7,6 @@ stored. The figures are those of `MapEvaluation`: of labelled queries, else of o
 from __future__ import annotations
 
 import contextlib
-from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 from uuid import UUID
@@ -19,7 +18,9 @@ from rich.table import Column
 from rich.text import Text
 from sqlalchemy import select
 
-from services.cli.descriptors.local_extractor import decode_pixels, describe_photos, load_extractor
+from lab.cli.descriptors.extractors import photo_decoder, photo_describer
+from lab.evaluation.ranking import check_finite
+from services.cli.descriptors.load_extractor import load_extractor
 from services.cli.descriptors.local_weights import has_local_weights, list_extractor_configs
 from services.cli.environment import read_settings
 from services.cli.output import (
@@ -221,26 +222,16 @@ class MapComparison:
 
     def _describe_with(self, pipeline: DescriptorPipeline) -> Described:
         extractor, centres, projection = pipeline.extractor, pipeline.centres, pipeline.projection
-        seconds, described = defaultdict[str, float](float), list[Any]()
-        refused: list[tuple[UUID, PlacewiseError]] = []
+        describe = photo_describer(extractor, centres, self._settings, projection, self._read)
+        described = list[Any]()
         report = stage_bars(self._progress, f"{extractor.config.name}: ")
-        for batch in describe_photos(
-            self._photos,
-            extractor,
-            centres,
-            self._settings,
-            refused,
-            seconds,
-            projection,
-            self._read,
-        ):
+        for batch in describe(self._photos):
             described.extend(batch)
             report("describing", len(described), len(self._photos))
-        if refused:
-            raise refused[0][1]
         rows = np.stack(described)
+        check_finite(rows, self._photos)
         scores = rows @ rows[: len(self.evaluation.database.photos)].T
-        return Described(scores, seconds["describe"] / len(rows), rows.shape[1])
+        return Described(scores, describe.seconds / len(rows), rows.shape[1])
 
     def _load(self, config: ExtractorConfig) -> DescriptorPipeline:
         """Load an extractor, with the vocabulary in use, a shipped one, or one fitted here."""
@@ -254,9 +245,10 @@ class MapComparison:
         number = len(self.evaluation.database.photos)
         numbers = sample_photos(number, DEFAULT_SAMPLE_PHOTOS, extractor.backbone.width, SEED)
         sample = [self._photos[number] for number in numbers]
+        decoder = photo_decoder(extractor, self._settings, self._read)
         fitted = fit_vocabulary(
             extractor,
-            decode_pixels(sample, extractor.preprocessing, self._settings, [], self._read),
+            (pixels for _, pixels in decoder.batches(sample, [])),
             len(sample),
             clusters=config.clusters,
             seed=SEED,
@@ -264,11 +256,8 @@ class MapComparison:
         )
         return DescriptorPipeline(extractor, fitted.centres)
 
-    def _read(self, photo_id: UUID) -> bytes | PlacewiseError:
-        try:
-            return self._store.get(self._keys[photo_id])
-        except NotFound as error:  # deleted since
-            return error
+    def _read(self, photo_id: UUID) -> bytes:
+        return self._store.get(self._keys[photo_id])  # NotFound: deleted since
 
     def _uses_own_vocabulary(self, config: ExtractorConfig) -> bool:
         """Whether the vocabulary in use is of the part that needs one."""
