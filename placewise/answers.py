@@ -6,7 +6,7 @@ Fields that a newer server adds are available as attributes, too.
 
 from __future__ import annotations
 
-from datetime import datetime
+from datetime import datetime, timedelta
 from typing import Any
 from uuid import UUID
 
@@ -295,8 +295,14 @@ class PhotoHeader(Answer):
     """UTC; if `time_zone_is_known` is False, the camera's clock as if it were UTC"""
     time_zone_is_known: bool
     camera: str | None
+    camera_is_unique: bool
+    """`camera` contains a serial number or an owner"""
+    clock_offset: timedelta | None
+    """of the camera's clock from UTC, by its tag or the GPS time"""
     latitude: float | None
     longitude: float | None
+    gps_error: str | None
+    """why the photo may have coordinates although none are known"""
     focal_length: float | None = None
     """as a multiple of the photo's longer side"""
 

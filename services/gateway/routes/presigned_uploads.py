@@ -52,7 +52,7 @@ from shared.catalog.maps import get_map
 from shared.catalog.photos import PresignedUpload, get_presigned_upload
 from shared.errors import Conflict, NotFound, Unavailable, Unprocessable
 from shared.ids import new_id
-from shared.ingest.photo_metadata import PhotoFields, check_coordinate_pair
+from shared.ingest.photo_metadata import PhotoFields, coordinate_pair
 from shared.ingest.store_photo import StoreResult, insert_photo
 from shared.ingest.validation import (
     StoredUpload,
@@ -281,9 +281,10 @@ def _parse_photo_fields(values: dict[str, Any]) -> PhotoFields:
     columns = PhotoUpdate.model_validate(values).to_columns()
     if "attributes" in columns:
         columns["metadata"] = columns.pop("attributes")
-    fields = PhotoFields(**columns)
-    check_coordinate_pair(fields.latitude, fields.longitude)
-    return fields
+    columns["latitude"], columns["longitude"] = coordinate_pair(
+        columns.get("latitude"), columns.get("longitude")
+    )
+    return PhotoFields(**columns)
 
 
 def _require_presigning_store(gateway: GatewayContext) -> PresigningStore:

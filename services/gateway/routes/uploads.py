@@ -28,8 +28,8 @@ from services.gateway.schemas import UploadResponse, accepted_headers, url_in_ma
 from services.gateway.uploads.multipart import FormFile, multipart_schema, receive_form_file
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.photos import PhotoRole
+from shared.imaging.capture_place import MAX_ALTITUDE_M
 from shared.imaging.file_formats import ACCEPTED_PHOTOS, photo_suffix
-from shared.imaging.photo_header import MAX_ALTITUDE_M
 from shared.ingest.store_photo import StoreResult, insert_photo
 from shared.ingest.validation import check_photo_signature, validate_photo
 from shared.jobs import Job, JobState
