@@ -79,6 +79,7 @@ class Uploaded(Answer):
     status: str
     status_url: str
     already_there: bool
+    updated: list[str]
     message: str
 
 
