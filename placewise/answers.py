@@ -29,7 +29,7 @@ class Answer(BaseModel):
 
 
 class Photo(Answer):
-    """A stored photo. Coordinates are WGS 84 degrees; `heading` is clockwise from north."""
+    """A stored photo. Coordinates are WGS 84 degrees; `heading` is clockwise from true north."""
 
     image_id: UUID
     image_path: str

@@ -65,5 +65,5 @@ def test_a_photo_that_was_geotagged_since_is_updated_and_not_doubled(
         report = index(server, tmp_path)
         assert (report["already_there"], report["updated"], report["refused"]) == (2, updated, [])
     [photo] = server.client.get("/api/v1/search", params={"near": "45.75,7.25,1"}).json()["images"]
-    file = server.client.get(f"/api/v1/uploads/{photo['file_id']}/image")
+    file = server.client.get(f"/api/v1/uploads/{photo['image_id']}/image")
     assert file.content == geotagged

@@ -48,7 +48,12 @@ UPLOAD_FORM = multipart_schema(
         "maximum": MAX_ALTITUDE_M,
         "description": "metres",
     },
-    heading={"type": "number", "minimum": 0, "maximum": 360},
+    heading={
+        "type": "number",
+        "minimum": 0,
+        "maximum": 360,
+        "description": "degrees clockwise from true north",
+    },
     captured_at={"type": "string", "format": "date-time"},
     place={**_TEXT_SCHEMA, "description": "a label, for places without useful coordinates"},
     tags={**_TEXT_SCHEMA, "description": "separated by commas"},
