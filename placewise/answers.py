@@ -6,7 +6,7 @@ Fields that a newer server adds are available as attributes, too.
 
 from __future__ import annotations
 
-from datetime import datetime
+from datetime import datetime, timedelta
 from typing import Any
 from uuid import UUID
 
@@ -29,7 +29,7 @@ class Answer(BaseModel):
 
 
 class Photo(Answer):
-    """A stored photo. Coordinates are WGS 84 degrees; `heading` is clockwise from north."""
+    """A stored photo. Coordinates are WGS 84 degrees; `heading` is clockwise from true north."""
 
     image_id: UUID
     image_path: str
@@ -79,6 +79,7 @@ class Uploaded(Answer):
     status: str
     status_url: str
     already_there: bool
+    updated: list[str]
     message: str
 
 
@@ -295,8 +296,14 @@ class PhotoHeader(Answer):
     """UTC; if `time_zone_is_known` is False, the camera's clock as if it were UTC"""
     time_zone_is_known: bool
     camera: str | None
+    camera_is_unique: bool
+    """`camera` contains a serial number or an owner"""
+    clock_offset: timedelta | None
+    """of the camera's clock from UTC, by its tag or the GPS time"""
     latitude: float | None
     longitude: float | None
+    gps_error: str | None
+    """why the photo may have coordinates although none are known"""
     focal_length: float | None = None
     """as a multiple of the photo's longer side"""
 

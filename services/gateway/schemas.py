@@ -437,7 +437,10 @@ class UploadResponse(ResponseModel):
     upload_time: datetime
     status: JobState
     status_url: str
-    already_there: bool = Field(description="the map already has these bytes; nothing was stored")
+    already_there: bool = Field(description="the map already has this picture; no photo was added")
+    updated: list[str] = Field(
+        description="values of the map's photo that new metadata of its file has set"
+    )
     message: str
 
 

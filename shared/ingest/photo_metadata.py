@@ -19,7 +19,7 @@ from typing import Any
 
 from shared.catalog.photo_role import PhotoRole
 from shared.errors import InvalidRequest, PlacewiseError, TooLarge, invalid_field_error, shorten
-from shared.imaging.photo_header import MAX_ALTITUDE_M
+from shared.imaging.capture_place import MAX_ALTITUDE_M, is_null_island
 
 MAX_TAGS = 50
 MAX_METADATA_CHARACTERS = 100_000
@@ -66,9 +66,12 @@ def read_form_fields(form: dict[str, str]) -> PhotoFields:
                 name, f"is unknown; the known fields are {', '.join(FORM_FIELDS)}"
             )
     values = {name: value.strip() for name, value in form.items() if value.strip()}
-    fields = PhotoFields(
-        latitude=_number(values, "latitude", -90, 90),
-        longitude=_number(values, "longitude", -180, 180),
+    latitude, longitude = coordinate_pair(
+        _number(values, "latitude", -90, 90), _number(values, "longitude", -180, 180)
+    )
+    return PhotoFields(
+        latitude=latitude,
+        longitude=longitude,
         altitude=_number(values, "altitude", -MAX_ALTITUDE_M, MAX_ALTITUDE_M),
         heading=_heading(values),
         captured_at=parse_time("captured_at", values["captured_at"])
@@ -80,17 +83,24 @@ def read_form_fields(form: dict[str, str]) -> PhotoFields:
         role=_role(values["role"]) if "role" in values else None,
         relative_path=parse_relative_path(values.get("relative_path", "")),
     )
-    check_coordinate_pair(fields.latitude, fields.longitude)
-    return fields
 
 
-def check_coordinate_pair(latitude: float | None, longitude: float | None) -> None:
-    """Raise Unprocessable (`invalid_field`) where only one coordinate is set."""
+def coordinate_pair(
+    latitude: float | None, longitude: float | None
+) -> tuple[float | None, float | None]:
+    """Return both coordinates; 0, 0 are none, since receivers without a fix write them.
+
+    Raises:
+        Unprocessable: `invalid_field` where only one is set.
+    """
     if (latitude is None) != (longitude is None):
         missing = "latitude" if latitude is None else "longitude"
         raise invalid_field_error(
             missing, "is missing: set both latitude and longitude, or neither"
         )
+    if latitude is None or longitude is None or is_null_island(latitude, longitude):
+        return None, None
+    return latitude, longitude
 
 
 def parse_time(field: str, text: str) -> datetime:

@@ -66,6 +66,7 @@ UPLOADED: dict[str, Any] = {
     "status": "queued",
     "status_url": "/",
     "already_there": False,
+    "updated": [],
     "message": "",
 }
 SIMILAR: dict[str, Any] = {

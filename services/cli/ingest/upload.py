@@ -72,9 +72,9 @@ def upload_photos(
     refused. Uploads that the journal records are skipped, and new ones are recorded.
 
     Returns:
-        Counts (`photos`, `uploaded`, `already_there`, and `searchable` in the whole map), the
-        `refused` and `failed` photos with reasons, the kind of the map's `vocabulary`, and the job
-        of the vocabulary that was `fitted`, if any.
+        Counts (`photos`, `uploaded`, `already_there`, `updated`, and `searchable` in the whole
+        map), the `refused` and `failed` photos with reasons, the kind of the map's `vocabulary`,
+        and the job of the vocabulary that was `fitted`, if any.
     """
     client.stats()  # fails early, and once, for a wrong URL, key or map
     counts: Counter[str] = Counter()
@@ -108,6 +108,7 @@ def upload_photos(
             refused.append(_photo_failure(photo, outcome.detail))
             continue
         counts["already_there" if outcome.already_there else "uploaded"] += 1
+        counts["updated"] += bool(outcome.updated)
         if journal is not None:
             journal.add(photo, outcome)
         if outcome.job_id is not None and outcome.status not in FINISHED:
@@ -122,6 +123,7 @@ def upload_photos(
         "photos": len(photos),
         "uploaded": counts["uploaded"],
         "already_there": counts["already_there"],
+        "updated": counts["updated"],
         "searchable": stats.searchable_images,
         "refused": refused,
         "failed": failed,

@@ -14,13 +14,11 @@ from typing import Any
 
 from PIL import Image
 
-from services.cli.ingest.geotags import list_photos
-from services.cli.output import print_note, printable_path, utf8_path
-from shared.errors import InvalidRequest, Misconfigured, PlacewiseError
-from shared.imaging.photo_header import PhotoHeader, read_photo_header
+from services.cli.locate.folder import read_folder
+from services.cli.output import print_note, printable_path
+from shared.errors import InvalidRequest, Misconfigured
 
 UNKNOWN_BEGIN = datetime.fromtimestamp(0, UTC)  # the time of a file is that of its last copy
-MAX_HEADER_PIXELS = 2**31  # only headers are read here; the server has a limit of its own
 MIN_STEP = timedelta(milliseconds=1)  # between photos whose clocks show the same time
 ROUNDING_SECONDS = 1e-6
 JPEG_QUALITY = 92  # of the frames of a video
@@ -69,8 +67,8 @@ def read_photo_frames(folder: Path, timing: FrameTiming) -> list[SourceFrame]:
     Raises:
         InvalidRequest: `no_photos`; `no_times` if a photo of `Order.TIME` has no time.
     """
-    photos = [(path, _header_of(path)) for path in list_photos(folder)]
-    without_time = next((path for path, header in photos if header.captured_at is None), None)
+    photos = read_folder(folder, None, 0.0)
+    without_time = next((photo.path for photo in photos if photo.time is None), None)
     if timing.order == Order.TIME and without_time is not None:
         raise InvalidRequest(
             "no_times",
@@ -83,15 +81,15 @@ def read_photo_frames(folder: Path, timing: FrameTiming) -> list[SourceFrame]:
         _print_clock(timing.begin, None, "photos in the order of their names")
     frames = [
         SourceFrame(
-            path,
-            utf8_path(path.relative_to(folder)),
+            photo.path,
+            photo.name,
             first + timedelta(seconds=number * timing.every_seconds)
-            if by_name or header.captured_at is None
-            else header.captured_at,
-            header.latitude,
-            header.longitude,
+            if by_name or photo.time is None
+            else photo.time,
+            photo.latitude,
+            photo.longitude,
         )
-        for number, (path, header) in enumerate(photos)
+        for number, photo in enumerate(photos)
     ]
     return _with_distinct_times(sorted(frames, key=lambda frame: frame.captured_at))
 
@@ -178,13 +176,6 @@ def _upright(frame: Any, tagged: str) -> Image.Image:
         quarters = round(math.atan2(-b, a) / (math.pi / 2))
     turn = COUNTERCLOCKWISE[quarters % 4]
     return image if turn is None else image.transpose(turn)
-
-
-def _header_of(path: Path) -> PhotoHeader:
-    # The server names what is wrong with a photo that can't be read.
-    with contextlib.suppress(PlacewiseError, OSError), path.open("rb") as file:
-        return read_photo_header(file, MAX_HEADER_PIXELS)
-    return PhotoHeader(0, 0)
 
 
 def _with_distinct_times(frames: list[SourceFrame]) -> list[SourceFrame]:

@@ -47,15 +47,15 @@ from shared.catalog.maps import get_map, increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole, get_photo, mark_photo_deleted
 from shared.errors import NotFound, invalid_field_error
 from shared.http.request_model import RequestModel
+from shared.imaging.capture_place import MAX_ALTITUDE_M
 from shared.imaging.file_formats import needs_preview
-from shared.imaging.photo_header import MAX_ALTITUDE_M
 from shared.ingest.photo_metadata import (
     MAX_METADATA_FIELDS,
     MAX_PATH_CHARACTERS,
     MAX_TAGS,
     MAX_TEXT_CHARACTERS,
-    check_coordinate_pair,
     check_metadata,
+    coordinate_pair,
     parse_relative_path,
     parse_tags,
     parse_time,
@@ -136,7 +136,7 @@ def patch_photo(
         photo = get_photo(session, map_.id, file_id)
         for name, value in columns.items():
             setattr(photo, name, value)
-        check_coordinate_pair(photo.latitude, photo.longitude)
+        photo.latitude, photo.longitude = coordinate_pair(photo.latitude, photo.longitude)
         photo.changed_version = increment_map_version(session, map_.id)
         session.flush()
         return _photo_detail_response(session, photo, query.map)
