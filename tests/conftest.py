@@ -37,6 +37,7 @@ from tests.support.spare_databases import SpareDatabases
 REAL_PHOTOS = "PLACEWISE_TEST_DATA"
 BROWSER = "PLACEWISE_TEST_BROWSER"
 IMAGES = "PLACEWISE_TEST_IMAGES"
+CHAOS = "PLACEWISE_TEST_CHAOS"
 SERVER_FIXTURES = frozenset({"postgres", "redis", "s3", "moto"})
 SERVER_PARAMETERS = frozenset({"postgresql", "redis", "s3", "moto", "bucket"})
 TESTS = Path(__file__).parent
@@ -49,8 +50,13 @@ gc.set_threshold(50_000)
 # Imports freeze their objects, of which triton would report hundreds as leaked at the end.
 atexit.register(gc.unfreeze)
 collect_ignore = [
-    folder
-    for variable, folder in ((BROWSER, "browser"), (IMAGES, "deploy/images"))
+    path
+    for variable, paths in (
+        (BROWSER, ["browser"]),
+        (IMAGES, ["deploy/images"]),
+        (CHAOS, ["faults/test_chaos.py", "faults/test_rolling.py"]),
+    )
+    for path in paths
     if not os.environ.get(variable)
 ]
 
@@ -130,6 +136,10 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     if not os.environ.get(IMAGES):
         terminalreporter.write_line(
             "The tests of the images were left out: make test-images runs them."
+        )
+    if not os.environ.get(CHAOS):
+        terminalreporter.write_line(
+            "The tests of a deployment under faults were left out: make test-chaos runs them."
         )
 
 
