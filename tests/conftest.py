@@ -97,15 +97,19 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run a test of the catalog on both databases, or on those that its nearest marker names."""
+    """Run a test of the catalog on both databases, a test of `integration` on PostgreSQL, or on
+    those that its nearest marker names."""
     if "catalog_kind" in metafunc.fixturenames:
         marker = metafunc.definition.get_closest_marker("databases")
-        metafunc.parametrize("catalog_kind", marker.args if marker else ("sqlite", "postgresql"))
+        integration = _kind(metafunc.definition.path) == "integration"
+        default = ("postgresql",) if integration else ("sqlite", "postgresql")
+        metafunc.parametrize("catalog_kind", marker.args if marker else default)
 
 
 def _places(items: list[pytest.Item], kinds: tuple[str, ...]) -> dict[Path, float]:
     """The relative position of each file among those of these kinds, from 0 to 1."""
-    files = {item.path: kinds.index(_kind(item)) for item in items if _kind(item) in kinds}
+    paths = dict.fromkeys(item.path for item in items)
+    files = {path: kinds.index(_kind(path)) for path in paths if _kind(path) in kinds}
     ordered = sorted(files, key=files.__getitem__)
     return {file: place / len(ordered) for place, file in enumerate(ordered)}
 
@@ -118,8 +122,8 @@ def _needs_server(item: pytest.Item) -> bool:
     return bool(fixtures & SERVER_FIXTURES or parameters & SERVER_PARAMETERS)
 
 
-def _kind(item: pytest.Item) -> str:
-    kind, below, *_ = item.path.relative_to(TESTS).parts
+def _kind(path: Path) -> str:
+    kind, below, *_ = path.relative_to(TESTS).parts
     return below if kind == "lab" else kind
 
 

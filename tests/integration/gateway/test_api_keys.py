@@ -22,9 +22,6 @@ from tests.integration.api_with_keys import ADMIN, Door
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 
-# tests/e2e/test_api_key_required.py does the same on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 
 def test_a_key_is_shown_once_and_kept_as_a_hash(door: Door) -> None:
     made = door.key("read", "write")

@@ -39,9 +39,6 @@ from tests.support.checkpoints import none_added
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
 
-# tests/e2e/test_maps.py does the same on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 
 class Away(Exception):
     pass

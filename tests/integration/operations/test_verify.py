@@ -21,9 +21,6 @@ from tests.integration.in_process_api import Service
 from tests.integration.workplace import Workplace
 from tests.support.catalog_rows import add_reconstruction
 
-# tests/e2e/test_backup_and_verify.py does the same on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 
 def looked(service: Service, *, originals: bool = False) -> IntegrityReport:
     return verify_store(service.catalog, service.store, originals=originals)

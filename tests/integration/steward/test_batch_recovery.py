@@ -21,9 +21,6 @@ from shared.storage import FolderStore, ObjectStore
 from tests.integration.steward.batches import Batches, Killed, codes, counts, files, restart
 from tests.support.catalog_rows import read_job
 
-# tests/e2e/test_batches.py does the same on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 
 def assert_each_is_there_once(batches: Batches, job_id: UUID, photos: int) -> None:
     job = batches.finish(job_id)

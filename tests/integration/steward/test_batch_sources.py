@@ -21,9 +21,6 @@ from tests.support.archives import tar_of, zip_of
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 
-# tests/e2e/test_batches.py does the same on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 
 def test_every_photo_below_a_prefix_comes_in_and_again_nothing_twice(batches: Batches) -> None:
     names = ("monday/1.jpg", "monday/north/2.JPG", "tuesday/3.jpg")

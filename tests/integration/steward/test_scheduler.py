@@ -38,9 +38,6 @@ from tests.support.catalog_rows import (
     upload,
 )
 
-# tests/e2e runs the scheduler on SQLite, in every embedded server.
-pytestmark = pytest.mark.databases("postgresql")
-
 
 @pytest.mark.databases("sqlite", "postgresql")
 def test_collecting_twice_at_once_harms_nothing(chunk_map: ChunkMap) -> None:
