@@ -234,7 +234,7 @@ def test_a_track_of_places_is_drawn_over_time(tmp_path: Path) -> None:
     assert located_segments(track_of(None)) == []
 
 
-def test_text_in_a_table_is_no_formula_for_a_spreadsheet(tmp_path: Path) -> None:
+def test_csv_cells_are_no_formulas_for_a_spreadsheet(tmp_path: Path) -> None:
     named = RIDE.frames[0].model_copy(update={"filename": "-1.jpg"})
     write_track_file(tmp_path / "ride.csv", RIDE.model_copy(update={"frames": [named]}), [])
     [row] = csv.DictReader((tmp_path / "ride.csv").read_text().splitlines())
