@@ -173,7 +173,7 @@ def test_published_ground_truth_is_checked_by_its_rows_and_indices(tmp_path: Pat
 
 
 @pytest.mark.parametrize("message", ["", "[]", "{}", json.dumps({"database": 3, "rule": "x"})])
-def test_broken_word_of_what_it_belongs_to_is_no_permission(tmp_path: Path, message: str) -> None:
+def test_a_corrupt_fingerprint_of_the_lists_is_refused(tmp_path: Path, message: str) -> None:
     path = written(tmp_path)
     path.with_suffix(".json").write_text(message)
     with refused("bad_ground_truth"):
