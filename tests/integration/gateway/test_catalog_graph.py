@@ -63,7 +63,7 @@ def ids_of(table: PhotoTable) -> set[str]:
 
 
 @pytest.mark.databases("sqlite", "postgresql")
-def test_the_catalog_answers_as_arrays_do(catalog: Catalog, map_id: UUID) -> None:
+def test_the_graph_of_the_catalog_equals_that_of_arrays(catalog: Catalog, map_id: UUID) -> None:
     with catalog.read() as session:
         graph = CatalogPhotoGraph(session, map_id)
         assert graph.photo_count == 180

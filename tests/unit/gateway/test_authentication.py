@@ -119,7 +119,7 @@ def test_loopback_addresses_are_those_that_only_this_machine_reaches(
     assert is_loopback(host) is expected
 
 
-def test_an_admin_may_everything_and_no_other_scope_implies_one() -> None:
+def test_the_admin_scope_implies_all_and_no_other_implies_one() -> None:
     assert expand_scopes([Scope.ADMIN]) == set(Scope)
     assert expand_scopes([Scope.WRITE]) == {Scope.WRITE}
     assert expand_scopes([Scope.READ, Scope.WRITE]) == {Scope.READ, Scope.WRITE}
@@ -147,7 +147,7 @@ def test_without_keys_calls_on_loopback_are_allowed(host: str) -> None:
         {"host": "localhost:8000", "origin": ""},
     ],
 )
-def test_without_keys_no_page_of_elsewhere_may_call(fields: dict[str, str]) -> None:
+def test_without_keys_cross_origin_calls_are_refused(fields: dict[str, str]) -> None:
     with pytest.raises(Forbidden) as caught:
         check(LocalhostAuthenticator(), **fields)
     assert caught.value.code == "foreign_page"
@@ -166,7 +166,7 @@ def test_without_keys_what_a_proxy_forwards_is_refused(header: str) -> None:
     assert header.lower() in caught.value.detail.lower()
 
 
-def test_without_keys_a_page_that_is_trusted_may_call_this_machine() -> None:
+def test_without_keys_a_trusted_origin_may_call_loopback() -> None:
     keys = LocalhostAuthenticator(["https://maps.example"])
     check(keys, host="localhost:8000", origin="https://maps.example")
     for reported in ({"origin": "https://maps.example.evil"}, {"host": "maps.example"}):
@@ -178,7 +178,7 @@ def test_without_keys_a_page_that_is_trusted_may_call_this_machine() -> None:
 
 
 @pytest.mark.parametrize("value", ["short", "x" * 15, "with a blank in it all", "schlüssel" * 4])
-def test_a_chosen_key_that_can_be_guessed_or_not_be_sent_is_refused(
+def test_a_weak_or_unsendable_admin_key_is_refused(
     monkeypatch: pytest.MonkeyPatch, value: str
 ) -> None:
     monkeypatch.setenv("ADMIN_KEY", value)
@@ -199,7 +199,7 @@ def test_a_chosen_key_is_masked_and_an_empty_one_is_none(monkeypatch: pytest.Mon
 # --- the folder ------------------------------------------------------------------------------
 
 
-def test_what_is_written_privately_is_readable_by_its_user_alone(tmp_path: Path) -> None:
+def test_private_files_are_readable_by_their_owner_alone(tmp_path: Path) -> None:
     file = tmp_path / "secret"
     file.write_text("an old one that everyone could read")
     file.chmod(0o644)
