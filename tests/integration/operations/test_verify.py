@@ -40,7 +40,7 @@ def mend(service: Service, report: IntegrityReport) -> int:
     return repair_descriptors(service.catalog, InProcessWakeups(), report)
 
 
-def test_a_whole_store_has_no_faults_and_the_bytes_of_a_deleted_photo_are_not_missed(
+def test_an_intact_store_has_no_faults_and_deleted_photos_need_no_objects(
     service: Service,
 ) -> None:
     first, *_ = service.indexed(1, 2, 3)

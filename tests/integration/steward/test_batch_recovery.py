@@ -103,7 +103,7 @@ def test_a_steward_whose_lease_was_taken_over_commits_nothing(
     assert_each_is_there_once(batches, job_id, 4)
 
 
-def test_an_item_that_kills_its_stewards_is_given_up_and_the_others_come_in(
+def test_an_item_that_crashes_the_steward_fails_and_the_others_succeed(
     batches: Batches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job_id = batches.start_import(files(*range(4)))
@@ -177,13 +177,13 @@ def test_a_batch_waits_while_the_store_has_no_room_and_tries_again(
     assert_each_is_there_once(batches, job_id, 2)
 
 
-def test_bytes_that_wait_in_a_batch_are_no_orphans(batches: Batches) -> None:
+def test_objects_of_a_pending_batch_are_no_orphans(batches: Batches) -> None:
     job_id = batches.start(*files(1, 2))
     collect_orphans(batches.catalog, batches.store, age_seconds=-60)
     assert counts(batches.finish(job_id)) == (2, 2, 0)
 
 
-def test_a_forgotten_batch_takes_its_items_along(batches: Batches) -> None:
+def test_deleting_the_job_of_a_batch_deletes_its_items(batches: Batches) -> None:
     job_id = batches.start(*files(1))
     batches.finish(job_id)
     with batches.catalog.write() as session:

@@ -151,7 +151,7 @@ def test_rows_that_no_photo_ever_had_are_dropped(chunk_map: ChunkMap) -> None:
     chunk_map.check_rows(photo_ids[2:])
 
 
-def test_merging_twice_at_once_merges_once(
+def test_concurrent_compactions_merge_once(
     chunk_map: ChunkMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photo_ids = sum_of(chunk_map.chunks(2, 3))
