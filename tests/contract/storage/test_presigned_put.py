@@ -64,7 +64,7 @@ def test_other_bytes_another_size_and_another_key_are_refused(strict: S3Store) -
     assert list(strict.list("")) == []
 
 
-def test_an_address_is_good_for_a_while_only(strict: S3Store) -> None:
+def test_a_presigned_url_expires(strict: S3Store) -> None:
     put_here = presign(strict, seconds=-1)
     assert put(put_here.url, DATA, put_here.headers) in (400, 403)
     assert list(strict.list("")) == []
