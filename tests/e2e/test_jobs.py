@@ -172,7 +172,7 @@ def test_a_job_is_watched_until_its_final_state(server: ServerProcess) -> None:
     assert all(job["state"] in ("queued", "running") for job in jobs[:-1])
 
 
-def test_a_cancelled_job_stays_undone_until_it_is_retried(server: ServerProcess) -> None:
+def test_a_cancelled_job_runs_only_after_a_retry(server: ServerProcess) -> None:
     with server.no_decoding():
         uploaded = queued_job(server)
         answer = post(server, uploaded["job_id"], "cancel")

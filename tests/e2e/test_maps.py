@@ -125,7 +125,7 @@ def test_every_call_says_how_to_make_the_map_that_is_missing(server: ServerProce
 # --- each for itself -------------------------------------------------------------------------
 
 
-def test_searches_never_cross(server: ServerProcess) -> None:
+def test_searches_find_photos_of_their_map_alone(server: ServerProcess) -> None:
     one, other = make(server), make(server)
     numbers = [next(fresh) for _ in range(3)]
     here, there = store(server, one, *numbers), store(server, other, *numbers)
@@ -180,7 +180,7 @@ def test_what_belongs_to_one_map_is_not_found_in_another(server: ServerProcess) 
     assert (photo["place"], photo["searchable"]) == (None, True)
 
 
-def test_lists_and_figures_do_not_cross(server: ServerProcess) -> None:
+def test_lists_and_statistics_are_those_of_their_map(server: ServerProcess) -> None:
     one, other = make(server), make(server)
     (here, _) = store(server, one, next(fresh), next(fresh), place="hall")
     store(server, other, next(fresh))
