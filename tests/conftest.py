@@ -28,6 +28,7 @@ from tests.support.servers import (
     PostgresServer,
     RedisServer,
     S3Server,
+    start_moto,
     start_postgres,
     start_redis,
     start_s3,
@@ -49,16 +50,19 @@ COMPUTING = ("integration", "contract", "unit")
 gc.set_threshold(50_000)
 # Imports freeze their objects, of which triton would report hundreds as leaked at the end.
 atexit.register(gc.unfreeze)
-collect_ignore = [
-    path
-    for variable, paths in (
-        (BROWSER, ["browser"]),
-        (IMAGES, ["deploy/images"]),
-        (CHAOS, ["faults/test_chaos.py", "faults/test_rolling.py"]),
-    )
-    for path in paths
-    if not os.environ.get(variable)
-]
+# A variable, the paths that are collected where it is set, and what to say where it is not.
+OPTIONAL: tuple[tuple[str, list[str], str], ...] = (
+    (REAL_PHOTOS, [], f"on real photos: {REAL_PHOTOS}=FOLDER runs them (docs/CONTRIBUTING.md)"),
+    (BROWSER, ["browser"], "in a browser: make test-browser runs them"),
+    (IMAGES, ["deploy/images"], "of the images: make test-images runs them"),
+    (
+        CHAOS,
+        ["faults/test_chaos.py", "faults/test_rolling.py"],
+        "of a deployment under faults: make test-chaos runs them",
+    ),
+)
+LEFT_OUT = [option for option in OPTIONAL if not os.environ.get(option[0])]
+collect_ignore = [path for _, paths, _ in LEFT_OUT for path in paths]
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -128,23 +132,8 @@ def _kind(path: Path) -> str:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    if not os.environ.get(REAL_PHOTOS):
-        terminalreporter.write_line(
-            f"The tests on real photos were left out: set {REAL_PHOTOS} to a folder with "
-            "toy-places/ and anyloc-vocabularies/ to run them."
-        )
-    if not os.environ.get(BROWSER):
-        terminalreporter.write_line(
-            "The tests in a browser were left out: make test-browser runs them."
-        )
-    if not os.environ.get(IMAGES):
-        terminalreporter.write_line(
-            "The tests of the images were left out: make test-images runs them."
-        )
-    if not os.environ.get(CHAOS):
-        terminalreporter.write_line(
-            "The tests of a deployment under faults were left out: make test-chaos runs them."
-        )
+    for _, _, which in LEFT_OUT:
+        terminalreporter.write_line(f"Left out are the tests {which}.")
 
 
 @pytest.fixture(autouse=True)
@@ -183,6 +172,13 @@ def redis() -> Iterator[RedisServer]:
 def s3() -> Iterator[S3Server]:
     """A real S3 server, as above."""
     with start_s3() as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def moto() -> Iterator[S3Server]:
+    """A bucket that takes whatever is sent: what is signed protects nothing there."""
+    with start_moto() as server:
         yield server
 
 

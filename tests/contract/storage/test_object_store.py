@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from datetime import UTC, date, datetime, timedelta
 from typing import Any
 
@@ -15,7 +15,7 @@ from shared.errors import NotFound, StorageFull
 from shared.storage import FolderStore, ObjectStore, OwnedStore
 from shared.storage.keys import OWNER_MARK, trash_key
 from shared.storage.s3 import S3Store
-from tests.support.servers import S3Server, start_moto
+from tests.support.servers import S3Server
 
 MEGABYTE = 1_000_000
 
@@ -355,12 +355,6 @@ class TestS3Store(ObjectStoreContract):
                     store.put(f"originals/{name}", bytes(size))
             assert keys_of(store, "trash/") == []
             assert store.head(f"originals/{name}") is not None
-
-
-@pytest.fixture(scope="module")
-def moto() -> Iterator[S3Server]:
-    with start_moto() as server:
-        yield server
 
 
 class TestS3StoreOnMoto(ObjectStoreContract):

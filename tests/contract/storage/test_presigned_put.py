@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
 
 import pytest
 import urllib3
@@ -12,15 +11,9 @@ import urllib3
 from shared.errors import NotFound
 from shared.storage import PresignedPut
 from shared.storage.s3 import S3Store
-from tests.support.servers import S3Server, start_moto
+from tests.support.servers import S3Server
 
 DATA = os.urandom(100_000)
-
-
-@pytest.fixture(scope="module")
-def moto() -> Iterator[S3Server]:
-    with start_moto() as server:
-        yield server
 
 
 @pytest.fixture(params=["s3", "moto"])
