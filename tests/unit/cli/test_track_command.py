@@ -129,7 +129,7 @@ def test_a_video_gives_a_frame_every_so_many_seconds(
     assert shades == pytest.approx([40, 100, 160], abs=8)
 
 
-def test_what_is_no_video_is_named_and_so_is_the_missing_decoder(
+def test_unreadable_videos_and_a_missing_decoder_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = tmp_path / "notes.txt"

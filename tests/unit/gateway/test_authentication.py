@@ -39,7 +39,7 @@ KEY = "pw_0123456789abcdef"
 
 
 @pytest.mark.parametrize("header", ["Bearer abc", "bEARER abc", "Bearer   abc "])
-def test_the_key_is_read_whatever_the_schemes_case(header: str) -> None:
+def test_the_bearer_scheme_is_case_insensitive(header: str) -> None:
     assert parse_bearer(header) == "abc"
 
 
@@ -75,7 +75,7 @@ def check(keys: Authenticator, **headers: str) -> Caller:
     return asyncio.run(keys.authenticate(Headers(headers)))
 
 
-def test_any_of_the_keys_beside_the_catalog_opens_everything(none_stored: Catalog) -> None:
+def test_configured_keys_have_every_scope(none_stored: Catalog) -> None:
     keys = ApiKeyAuthenticator(none_stored, hash_api_key(KEY), hash_api_key("another"))
     assert check(keys, authorization=f"Bearer {KEY}").scopes == set(Scope)
     check(keys, authorization="Bearer another", origin="https://elsewhere.example")
@@ -98,7 +98,7 @@ def test_while_the_catalog_is_unreachable_only_the_configured_keys_are_accepted(
     away.close()
 
 
-def test_a_key_is_long_random_and_shows_little_of_itself() -> None:
+def test_a_key_is_long_and_random_and_its_prefix_is_short() -> None:
     made = {generate_api_key() for _ in range(100)}
     assert len({api_key_prefix(key) for key in made}) == 100
     for key in made:
