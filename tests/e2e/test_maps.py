@@ -206,37 +206,6 @@ def test_lists_and_statistics_are_those_of_their_map(server: ServerProcess) -> N
     assert [sum(s["jobs"].values()) for s in stats] == [3, 1]
 
 
-def test_a_fit_in_one_map_leaves_the_others_generation_alone(server: ServerProcess) -> None:
-    one, other = (make(server, extractor="test-tiny-vlad") for _ in range(2))
-    numbers = [next(fresh) for _ in range(3)]
-    for name in (one, other):
-        for number in numbers:
-            files = {"file": photo_bytes(number)}
-            got(server.client.post("/api/v1/upload", params={"map": name}, files=files), 202)
-
-    def fit(name: str, seed: int) -> str:
-        params = {"clusters": 4, "seed": seed}
-        answer = server.client.post("/api/v1/vocabularies", params={"map": name}, json=params)
-        job = ended(server, name, got(answer, 202)["job_id"])
-        assert job["state"] == "succeeded", job
-        generation: str = job["result"]["generation_id"]
-        return generation
-
-    def generation(name: str) -> Any:
-        return got(server.client.get(f"{MAPS}/{name}"))
-
-    fit(one, 0)
-    assert generation(other)["generation_id"] is None
-    assert generation(other)["searchable"] == 0
-    retained = fit(other, 0)
-    for seed in (1, 2):
-        fit(one, seed)
-    assert generation(other)["generation_id"] == retained
-    assert len(got(server.client.get("/api/v1/vocabularies", params={"map": other}))) == 1
-    assert len(got(server.client.get("/api/v1/generations", params={"map": one}))) == 3
-    assert generation(one)["searchable"] == generation(other)["searchable"] == 3
-
-
 # --- by command ------------------------------------------------------------------------------
 
 

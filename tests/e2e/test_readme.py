@@ -95,7 +95,7 @@ def shell(place: Path) -> Iterator[RunningShell]:
         )
     try:
         deadline = time.monotonic() + 120
-        while not _has_announced(place):
+        while not re.search(r"^  open: .+\n", (place / "run.log").read_text(), re.MULTILINE):
             assert process.poll() is None, (place / "run.log").read_text()
             assert time.monotonic() < deadline, (place / "run.log").read_text()
             time.sleep(0.1)
@@ -175,10 +175,6 @@ def test_make_run_shows_the_address_last_and_ends_its_server_with_its_shell(
 def _heed_signals() -> None:
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
-
-
-def _has_announced(place: Path) -> bool:
-    return re.search(r"^  open: .+\n", (place / "run.log").read_text(), re.M) is not None
 
 
 def test_make_alone_lists_its_targets_and_knows_each() -> None:

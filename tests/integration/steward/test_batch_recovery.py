@@ -124,21 +124,28 @@ def test_an_item_that_crashes_the_steward_fails_and_the_others_succeed(
     assert codes(batches.items(job_id)) == [None, None, "worker_crashed", None]
 
 
-def test_a_batch_pauses_while_the_object_store_is_unreachable(
-    batches: Batches, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("error", "waiting_for"),
+    [
+        (Unavailable("object_store_unavailable", "gone for lunch"), None),
+        (StorageFull("object_store_full", "no room"), "disk_space"),
+    ],
+)
+def test_a_batch_pauses_while_the_object_store_is_unreachable_or_full(
+    batches: Batches, monkeypatch: pytest.MonkeyPatch, error: Exception, waiting_for: str | None
 ) -> None:
     job_id = batches.start_import(files(1, 2))
-    real: Any = FolderStore.writer
 
-    def away(self: FolderStore, key: str) -> Any:
-        raise Unavailable("object_store_unavailable", "gone for lunch")
+    def fail(self: FolderStore, key: str) -> Any:
+        raise error
 
-    monkeypatch.setattr(FolderStore, "writer", away)
-    assert batches.work()
+    with monkeypatch.context() as patched:
+        patched.setattr(FolderStore, "writer", fail)
+        assert batches.work()
     job = read_job(batches.catalog, job_id)
-    assert (job.state, job.attempts) == (JobState.RUNNING, 0)
-    assert job.run_after is not None
-    monkeypatch.setattr(FolderStore, "writer", real)
+    assert (job.state, job.attempts, job.waiting_for) == (JobState.RUNNING, 0, waiting_for)
+    assert job.run_after is not None or waiting_for
+    resume_batches(batches.catalog, batches.settings)
     assert_each_is_there_once(batches, job_id, 2)
 
 
@@ -156,23 +163,6 @@ def test_a_batch_waits_while_the_disk_is_full_and_goes_on_by_itself(
     assert (job["state"], job["waiting_for"]) == ("running", "disk_space")
     assert (job["stage"], counts(job), batches.photos()) == ("store", (0, 2, 0), [])
     free.free += 1
-    resume_batches(batches.catalog, batches.settings)
-    assert_each_is_there_once(batches, job_id, 2)
-
-
-def test_a_batch_waits_while_the_store_has_no_room_and_tries_again(
-    batches: Batches, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    job_id = batches.start_import(files(1, 2))
-    real: Any = FolderStore.writer
-
-    def full(self: FolderStore, key: str) -> Any:
-        raise StorageFull("object_store_full", "no room")
-
-    monkeypatch.setattr(FolderStore, "writer", full)
-    assert batches.work()
-    assert batches.job(job_id)["waiting_for"] == "disk_space"
-    monkeypatch.setattr(FolderStore, "writer", real)
     resume_batches(batches.catalog, batches.settings)
     assert_each_is_there_once(batches, job_id, 2)
 
