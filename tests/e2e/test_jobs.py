@@ -41,15 +41,6 @@ def failed_job(server: ServerProcess) -> str:
     return job_id
 
 
-def queued_job(server: ServerProcess) -> dict[str, Any]:
-    """The upload of a photo whose job is queued behind others; inside `no_decoding`."""
-    for _ in range(3):  # one is described, one prepared, one more for good measure
-        server.upload(photo_bytes(next(fresh)))
-    uploaded: dict[str, Any] = server.upload(photo_bytes(next(fresh))).json()
-    assert get(server, uploaded["status_url"])["state"] == "queued"
-    return uploaded
-
-
 def post(server: ServerProcess, job_id: str, verb: str) -> httpx2.Response:
     return server.client.post(f"{JOBS}/{job_id}/{verb}")
 
@@ -172,9 +163,12 @@ def test_a_job_is_watched_until_its_final_state(server: ServerProcess) -> None:
     assert all(job["state"] in ("queued", "running") for job in jobs[:-1])
 
 
-def test_a_cancelled_job_stays_undone_until_it_is_retried(server: ServerProcess) -> None:
+def test_a_cancelled_job_runs_only_after_a_retry(server: ServerProcess) -> None:
     with server.no_decoding():
-        uploaded = queued_job(server)
+        for _ in range(3):  # one is described, one prepared, one more for good measure
+            server.upload(photo_bytes(next(fresh)))
+        uploaded = server.upload(photo_bytes(next(fresh))).json()
+        assert get(server, uploaded["status_url"])["state"] == "queued"
         answer = post(server, uploaded["job_id"], "cancel")
         assert answer.status_code == 200
         assert answer.json()["state"] == "cancelled"
@@ -216,11 +210,3 @@ def test_a_cancelled_query_has_no_result(server: ServerProcess) -> None:
         ).json()
         assert post(server, started["job_id"], "cancel").status_code == 200
         problem(server.client.get(started["result_url"]), 409, "job_cancelled")
-
-
-def test_the_job_of_a_deleted_photo_is_not_retried(server: ServerProcess) -> None:
-    with server.no_decoding():
-        uploaded = queued_job(server)
-        assert server.client.delete(f"/api/v1/uploads/{uploaded['file_id']}").status_code == 200
-        assert get(server, uploaded["status_url"])["state"] == "cancelled"
-        problem(post(server, uploaded["job_id"], "retry"), 409, "photo_deleted")

@@ -75,7 +75,7 @@ def test_write_rolls_back_when_its_block_raises(catalog: Catalog, map_id: UUID) 
         assert count_live_photos(session, map_id) == 1
 
 
-def test_read_never_writes(catalog: Catalog, map_id: UUID) -> None:
+def test_a_read_session_refuses_writes(catalog: Catalog, map_id: UUID) -> None:
     with pytest.raises(DBAPIError, match=r"read-?only"), catalog.read() as session:
         add_photo(session, map_id)
     with catalog.read() as session:

@@ -54,9 +54,6 @@ from tests.support.exported import (
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 
-# tests/e2e/test_serve_models.py does the same on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 PHOTOS = 3
 
 

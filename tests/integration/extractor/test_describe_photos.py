@@ -1,4 +1,4 @@
-"""The extractor describes photos and queries, with real decoder processes, on both databases."""
+"""The extractor describes photos and queries, with real decoder processes."""
 
 from __future__ import annotations
 
@@ -34,9 +34,6 @@ from tests.integration.extractor.conftest import Hook
 from tests.integration.workplace import Workplace, expected_row, once, same
 from tests.support.catalog_rows import failure_code, problem_of, set_columns
 from tests.support.photos import encoded, photo_bytes, photo_image
-
-# tests/e2e/test_upload.py and test_model_changes.py do the same on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
 
 
 def test_each_photo_gets_its_one_row_and_the_right_one(averages: Workplace) -> None:

@@ -35,9 +35,6 @@ from tests.integration.workplace import Workplace, expected_row, once, pixels_of
 from tests.support.catalog_rows import end_pauses, expire_lease, problem_of, states
 from tests.support.photos import photo_bytes
 
-# tests/faults/test_kills.py kills extractors on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 DAY_SECONDS = 86_400.0
 
 

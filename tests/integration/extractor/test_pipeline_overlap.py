@@ -20,9 +20,6 @@ from tests.integration.workplace import Workplace, expected_row, same
 from tests.support.catalog_rows import problem_of, set_columns
 from tests.support.photos import photo_bytes
 
-# tests/faults/test_kills.py kills extractors on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 WAIT_SECONDS = 90.0
 BATCH = 4  # tests.integration.conftest
 

@@ -24,9 +24,6 @@ from tests.support.catalog_rows import set_columns
 from tests.support.photos import photo_bytes
 from tests.support.vit import random_weights, save
 
-# tests/e2e/test_readme.py starts with a pooled map on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 VLAD = "test-tiny-vlad"
 POOLED = "test-tiny-vlad:aggregator=gem"
 

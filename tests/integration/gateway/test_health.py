@@ -16,9 +16,6 @@ from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import add_map, set_columns
 from tests.support.photos import photo_bytes
 
-# tests/e2e/test_legacy_settings.py reads the health of a Placewise on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 ANYLOC = "anyloc-vits14:clusters=2,layer=0"
 
 

@@ -379,7 +379,7 @@ def test_a_map_whose_place_model_finds_that_it_lacks_each_frame_is_not_tracked(
 
 
 @pytest.mark.databases("sqlite")
-def test_what_belongs_to_a_track_stays_and_goes_with_it(street: Service, catalog: Catalog) -> None:
+def test_rows_and_objects_of_a_track_are_deleted_with_it(street: Service, catalog: Catalog) -> None:
     pending, done = begin(street), begin(street)
     job_id = send(street, pending, 0)["job_id"]
     street.drain()

@@ -27,9 +27,6 @@ from tests.integration.steward.streets import HOUR, NOON, STREETS, WITHOUT_PLACE
 from tests.integration.town import Town, Watched
 from tests.support.catalog_rows import delete, read_job
 
-# tests/e2e/test_estimates.py evaluates a map on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 
 def test_leave_one_out_recall_is_what_one_counts_by_hand(town: Town) -> None:
     town.publish(STREETS)

@@ -23,9 +23,6 @@ from tests.support.catalog_rows import add_generation, expire_lease, failure_cod
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 
-# tests/e2e/test_estimates.py evaluates maps on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 
 @pytest.fixture
 def look_always(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -32,8 +32,7 @@ from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import add_chunk, add_generation, add_photo, failure_code, read_job
 from tests.support.problems import problem
 
-# tests/e2e/test_word_weights_command.py runs the job on SQLite.
-pytestmark = [pytest.mark.databases("postgresql"), pytest.mark.numerics]
+pytestmark = pytest.mark.numerics
 
 WORDS, WIDTH = 4, 8
 TRIED = 60  # photos

@@ -212,7 +212,7 @@ def test_interrupted_run_leaves_nothing_behind(
          "vocabulary_unusable", "384"),
     ],
 )  # fmt: skip
-def test_what_does_not_fit_together_is_refused_before_anything_is_loaded(
+def test_contradicting_options_are_refused_before_anything_is_loaded(
     photos: list[Path], out: Path, tmp_path: Path, arguments: list[str], code: str, message: str
 ) -> None:
     centres = tmp_path / "centres.npy"
@@ -230,7 +230,7 @@ def test_folder_that_is_not_there_is_named(photos: list[Path], tmp_path: Path) -
     assert str(out) in problem["detail"]
 
 
-def test_the_program_itself_describes(photos: list[Path], out: Path) -> None:
+def test_the_installed_program_describes_photos(photos: list[Path], out: Path) -> None:
     """As people call it: its children import the program anew."""
     program = [sys.executable, "-c", "from services.cli import main; main()"]
     ended = subprocess.run(

@@ -94,7 +94,7 @@ def test_a_folders_whitening_is_of_the_precision_that_photos_are_described_in(
     assert shorter["spec"] == {**spec, **{one: shorter["spec"][one] for one in LONGER}}
 
 
-def test_a_file_of_rows_is_enough(tmp_path: Path) -> None:
+def test_a_whitening_is_fitted_on_a_file_of_rows(tmp_path: Path) -> None:
     rows = unit_rows()
     rows[7] = 0  # a photo without anything to describe says nothing
     np.save(tmp_path / "rows.npy", rows)
@@ -138,7 +138,7 @@ def test_what_can_not_be_fitted_is_refused_and_nothing_is_written(
     assert [path.name for path in tmp_path.iterdir()] == ["rows.npy"]
 
 
-def test_what_is_no_file_of_rows_or_of_a_whitening_is_refused(folder: Path, tmp_path: Path) -> None:
+def test_malformed_files_of_rows_and_whitenings_are_refused(folder: Path, tmp_path: Path) -> None:
     text = tmp_path / "rows.npy"
     text.write_text("no rows")
     assert run("models", "fit-pca", text, "--out", tmp_path / "a.safetensors", code=1)["code"] == (

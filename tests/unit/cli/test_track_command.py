@@ -167,7 +167,7 @@ def test_raw_stream_is_read_whole_by_the_frame_rate_that_is_named(
     assert "10 frames a second are assumed" in capsys.readouterr().err
 
 
-def test_what_is_no_video_is_named_and_so_is_the_missing_decoder(
+def test_unreadable_videos_and_a_missing_decoder_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = tmp_path / "notes.txt"
@@ -272,7 +272,7 @@ def test_a_track_of_places_is_drawn_over_time(tmp_path: Path) -> None:
     assert located_segments(track_of(None)) == []
 
 
-def test_text_in_a_table_is_no_formula_for_a_spreadsheet(tmp_path: Path) -> None:
+def test_csv_cells_are_no_formulas_for_a_spreadsheet(tmp_path: Path) -> None:
     named = RIDE.frames[0].model_copy(update={"filename": "-1.jpg"})
     write_track_file(tmp_path / "ride.csv", RIDE.model_copy(update={"frames": [named]}), [])
     [row] = csv.DictReader((tmp_path / "ride.csv").read_text().splitlines())

@@ -143,7 +143,7 @@ def test_pairs_are_bounded_however_many_photos_there_are() -> None:
     assert chosen.counts() == [(MAX_PAIRS, MAX_PAIRS)] * 2
 
 
-def test_lessons_are_no_larger_than_memory_allows() -> None:
+def test_batches_have_at_most_the_photos_that_fit_into_memory() -> None:
     chosen = sample_pairs(street(60), seed=0, batch_photos=16)
     lessons = [*chosen.batches[0], *chosen.batches[1]]
     assert all(len(set(lesson.photos)) == len(lesson.photos) <= 16 for lesson in lessons)
@@ -158,7 +158,7 @@ def test_same_seed_gives_the_same_pairs_and_another_seed_others() -> None:
     assert one.halves == again.halves != other.halves
 
 
-def test_rooms_teach_by_their_labels() -> None:
+def test_pairs_are_sampled_by_place_labels_where_rooms_share_coordinates() -> None:
     """Also those that bear the coordinates of their building, all the same."""
     spots = [PhotoLocation(45.0, 7.0, f"room {n // 6}") for n in range(240)]
     chosen = sample_pairs(spots, seed=0, batch_photos=100)

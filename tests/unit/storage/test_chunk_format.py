@@ -236,7 +236,7 @@ def test_one_row_is_read_without_the_others(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["cut", "other"])
-def test_a_row_of_a_damaged_object_is_not_made_up(store: FolderStore, damage: str) -> None:
+def test_a_row_of_a_damaged_object_is_an_error(store: FolderStore, damage: str) -> None:
     rows = some_rows()
     chunk = written(store, rows, [new_id() for _ in rows])
     whole = store.get(chunk.object_key)

@@ -16,9 +16,6 @@ from shared.storage import FolderStore
 from shared.storage.chunks import manifest_key
 from tests.support.catalog_rows import add_chunk, add_generation, add_job, add_map, add_photo
 
-# The fault suite runs on PostgreSQL.
-pytestmark = pytest.mark.databases("postgresql")
-
 Found = dict[str, UUID]
 
 
