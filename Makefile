@@ -44,12 +44,9 @@ run: $(RUNNABLE) ## serve the embedded Placewise on http://HOST:PORT, data under
 	HOST=$(HOST) PORT=$(PORT) PLACEWISE_HOME=$(PLACEWISE_HOME) exec $(BIN)/placewise serve
 
 test: $(INSTALLED) ## all tests (PLACEWISE_TEST_DATA=FOLDER adds those on real photos)
-	$(BIN)/python -m pytest tests $(WITHOUT_LAB) --numprocesses auto --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest tests --numprocesses auto --dist loadfile --no-loadscope-reorder
 
-# Left out of `make test` where its code is that of the main branch.
-WITHOUT_LAB = $(shell git diff --quiet origin/HEAD -- lab shared/descriptors tests/lab 2>/dev/null && echo --ignore=tests/lab)
-
-test-lab: $(INSTALLED) ## tests of the lab (part of `make test` if lab/ or shared/descriptors changed)
+test-lab: $(INSTALLED) ## tests of the lab (part of `make test`)
 	$(BIN)/python -m pytest tests/lab --numprocesses auto --dist loadfile --no-loadscope-reorder
 
 test-chaos: $(INSTALLED) ## kill, stop and restart services of a whole deployment under load
