@@ -19,6 +19,7 @@ from shared.config.shards import SINGLE_SHARD
 from shared.integrity.verify import repair_descriptors, verify_store
 from shared.jobs import InProcessWakeups
 from shared.storage import FolderStore, ObjectStore, read_retries
+from shared.storage.copying import download_object
 from shared.storage.s3 import S3Store
 from tests.integration.in_process_api import Service
 from tests.support.problems import problem
@@ -124,12 +125,11 @@ def test_a_full_disk_of_the_cache_is_not_taken_for_damage(
     service.indexed(1)
     (searched,) = service.indexed(2)
     chunk = first_chunk(service)
-    real = chunk_loader.download_object
 
     def full(store: ObjectStore, key: str, target: Path) -> str:
         if key == chunk:
             raise OSError(errno.ENOSPC, "No space left on device", str(target))
-        return real(store, key, target)
+        return download_object(store, key, target)
 
     with monkeypatch.context() as disk:
         disk.setattr(chunk_loader, "download_object", full)

@@ -119,7 +119,7 @@ def megaloc() -> Tensors:
 def load_vit() -> Tensors:
     import timm
 
-    vit = timm.create_model("vit_small_patch14_dinov2", num_classes=0)
+    vit: Any = timm.create_model("vit_small_patch14_dinov2", num_classes=0)
     nn.init.normal_(vit.pos_embed)
     return dict(vit.state_dict())
 
