@@ -142,7 +142,7 @@ def _find_camera(request: PoseRequest, component: Component) -> Camera | None:
     """Return the camera of the query as that of a photo that is left out, or by its key."""
     for row, photo_id in enumerate(component.photo_ids):
         if photo_id in request.leave_out:
-            camera: Camera = component.cameras[component.camera_numbers[row]]
+            camera: Camera | None = component.cameras[component.camera_numbers[row]]
             return camera
     if request.camera_key is None:
         return None
