@@ -151,7 +151,7 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
             with catalog.write() as session:
                 delete_dead_search_workers(session, all_workers=True)
                 delete_processes(session, "extractor")
-            reclaim_leases(catalog, all_leases=True)
+            reclaim_leases(catalog, wakeups, all_leases=True)
 
         # After everything that can fail: a key that is created but not shown would be lost.
         host, port = listener.getsockname()[:2]
@@ -205,7 +205,8 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
                 process_heartbeat(catalog, "extractor", extractor.state),
             ):
                 threads = start_service_threads({"fits": extractor.fits.run}, stop)
-                extractor.run(stop, wakeups)
+                extractor.warm_up()
+                extractor.run(stop, wakeups.wait)
                 for thread in threads:
                     thread.join()
 

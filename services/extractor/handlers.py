@@ -93,14 +93,12 @@ def handles_model_change(kind: JobKind) -> Callable[[ModelChange], ModelChange]:
 
 @dataclass(slots=True)
 class DrainStats:
-    """Statistics of one drain, as logs and Flower show them; several threads update it."""
+    """Statistics of one drain, as logs show them; several threads update it."""
 
     maps: set[str] = field(default_factory=set)
     claimed: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
     seconds: Counter[str] = field(default_factory=Counter)
-    interrupted: bool = False
-    """Whether the drain stopped while there was work left."""
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def add_claim(self, jobs: Sequence[Job]) -> None:
@@ -125,7 +123,7 @@ class DrainStats:
         return self.outcomes["failed"]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the statistics as JSON, for logs and for Flower."""
+        """Return the statistics as JSON, for logs."""
         return {
             "maps": sorted(self.maps),
             "claimed": self.claimed,

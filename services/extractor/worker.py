@@ -19,10 +19,8 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import threading
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import replace
 from typing import Any
@@ -48,7 +46,7 @@ from shared.catalog.jobs import (
 )
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
-from shared.jobs import InProcessWakeups, Job, Priority
+from shared.jobs import Job, Priority, Wakeups
 from shared.jobs.claim import mark_started
 from shared.jobs.runner import JobRunner, job_trace_context
 from shared.jobs.transitions import make_waiting_jobs_claimable
@@ -64,7 +62,7 @@ QUERY_POLL_SECONDS = 0.1  # polling interval for queries while a bulk batch is d
 class ExtractorWorker:
     """Worker that describes the photos of queued jobs, one per GPU, or per process on a CPU.
 
-    Call `run` to work until stopped, or `drain` once for each wakeup.
+    Call `run` to work until stopped, or `drain` once.
     """
 
     def __init__(
@@ -78,8 +76,9 @@ class ExtractorWorker:
         registry: CollectorRegistry | None = None,
         decoders: DecoderPool | None = None,
         compute_fit: ComputeFit = compute_in_child,
+        wakeups: Wakeups | None = None,
     ) -> None:
-        """Create a worker with a name for its leases.
+        """Create a worker with a name for its leases, which reports its jobs to `wakeups`.
 
         As the `only_worker`, so that none can be of another release, it reindexes outdated
         generations.
@@ -93,9 +92,9 @@ class ExtractorWorker:
             catalog, store, settings, models, decoders or DecoderPool(settings)
         )
         on_outcome = self._metrics.count_step_outcome
-        self.fits = FitWorker(self.context, name, on_outcome, compute_fit)
+        self.fits = FitWorker(self.context, name, on_outcome, compute_fit, wakeups)
         drained = [kind for kind in EXTRACTOR_JOBS if kind not in CHILD_PROCESS_JOBS]
-        self._runner = JobRunner(catalog, settings, name, drained, on_outcome)
+        self._runner = JobRunner(catalog, settings, name, drained, on_outcome, wakeups)
         # Two threads, so that a query's photo does not wait for the photos of the next batch.
         self._prepare_executor = ThreadPoolExecutor(max_workers=2, thread_name_prefix="prepare")
         self._query_executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="queries")
@@ -123,17 +122,12 @@ class ExtractorWorker:
         if self._only_worker:
             reindex_outdated_generations(self.context.catalog, self.context.models)
 
-    def run(self, stop: threading.Event, wakeups: InProcessWakeups) -> None:
-        """Drain whenever there is work, until `stop` is set; used by the embedded worker.
+    def run(self, stop: threading.Event, wait: Callable[[float], object]) -> None:
+        """Drain whenever there is work, until `stop` is set; `wait` waits for a wakeup.
 
         Fits run in a thread of their own (`fits`).
         """
-        self.warm_up()
-        self._runner.run(lambda: self.drain(stop).claimed > 0, stop, wakeups.wait)
-
-    def drain_once(self, stop: threading.Event, seconds: float) -> DrainStats | None:
-        """Drain as `drain` does; pause and return None if the catalog was unavailable."""
-        return self._runner.run_once(lambda: self.drain(stop, seconds), stop)
+        self._runner.run(lambda: self.drain(stop).claimed > 0, stop, wait)
 
     def close(self) -> None:
         """Stop the threads and decoders; claimed jobs are requeued when their lease expires."""
@@ -142,30 +136,25 @@ class ExtractorWorker:
         self._prepare_executor.shutdown(wait=True, cancel_futures=True)
         self.context.decoders.close()
 
-    def drain(self, stop: threading.Event, seconds: float = math.inf) -> DrainStats:
-        """Process jobs until none is claimable, `stop` is set, or `seconds` have passed."""
-        stats, until = DrainStats(), time.monotonic() + seconds
-
-        def out_of_time() -> bool:
-            return stop.is_set() or time.monotonic() > until
-
+    def drain(self, stop: threading.Event) -> DrainStats:
+        """Process jobs until none is claimable, or `stop` is set."""
+        stats = DrainStats()
         current, upcoming = None, self._claim(stats)
         if upcoming is None:
             return stats
         with self._metrics.measure_drain():
             try:
                 while upcoming is not None:
-                    if out_of_time():
+                    if stop.is_set():
                         with upcoming.lease:
                             self._runner.requeue(upcoming)
-                        stats.interrupted = True
                         break
                     current = upcoming
                     # Claimed before the forward pass, so that its photos are decoded meanwhile.
                     upcoming = self._claim(stats)
                     if not _is_query(current):
                         # Otherwise the query would wait for this batch and the one being published.
-                        while upcoming is not None and _is_query(upcoming) and not out_of_time():
+                        while upcoming is not None and _is_query(upcoming) and not stop.is_set():
                             self._process(upcoming, stats, stop)
                             upcoming = self._claim(stats)
                     self._process(current, stats, stop)
@@ -243,6 +232,7 @@ class ExtractorWorker:
                 # From here on a crash may be caused by a photo: decoding ran in other processes.
                 with self.context.catalog.write() as session:
                     mark_started(session, batch.token, len(batch.jobs) + concurrent_jobs)
+                self._runner.report_started(batch)
                 if next(batch.stages, DONE) is not DONE:
                     return True
         self._record(batch, stats)
@@ -256,6 +246,7 @@ class ExtractorWorker:
     def _record(self, batch: JobBatch, stats: DrainStats) -> None:
         stats.add_batch(batch)
         self._metrics.observe_batch(batch)
+        self._runner.report_ended(batch)
 
     @contextlib.contextmanager
     def _answering_queries(self, stats: DrainStats, stop: threading.Event) -> Iterator[None]:

@@ -35,7 +35,7 @@ from shared.catalog.maps import get_map
 from shared.jobs import JobKind, JobState
 from shared.jobs.model_changes import cancel_model_change
 from shared.jobs.transitions import cancel_batch, cancel_job, retry_batch, retry_job
-from shared.jobs.wakeups import queue_for_priority
+from shared.jobs.wakeups import read_job_messages, report_jobs
 
 router = APIRouter(tags=["jobs"])
 
@@ -127,7 +127,9 @@ def cancel_job_by_id(
         idempotent.store_response(session, 200, response)
         return response
 
-    return gateway.catalog.run(cancel)
+    response = gateway.catalog.run(cancel)
+    report_jobs(gateway.catalog, gateway.wakeups, [job_id])
+    return response
 
 
 @router.post("/jobs/{job_id}/retry", operation_id="retry_job", dependencies=[WRITE, ADMIT_JOB])
@@ -145,7 +147,9 @@ def retry_job_by_id(
         session.refresh(job)
         response = JobResponse.of(job, query.map)
         idempotent.store_response(session, 200, response)
-    gateway.wakeups.send(queue_for_priority(job.priority))
+        messages = read_job_messages(session, [job.id])
+    report_jobs(gateway.catalog, gateway.wakeups, [job.id])
+    gateway.wakeups.send(*messages)
     return response
 
 

@@ -210,7 +210,7 @@ def _complete_upload(
             _replay_if_completed(locked)
             outcome = UploadOutcome.of(stored, stored.job, key, map_name)
             locked.status, locked.response_body = outcome.status, outcome.body.model_dump_json()
-    finish_upload(gateway, stored, key)
+    finish_upload(gateway, stored, key, map_name)
     # The photo is acknowledged already; garbage collection deletes the object if this fails.
     with contextlib.suppress(Unavailable):
         store.delete(source_key)

@@ -35,6 +35,7 @@ from shared.geodesy import distance_m
 from shared.geometry.colmap_model import ColmapModel, rename_images
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
+from shared.jobs.wakeups import JobMessage
 from shared.storage.keys import new_checkpoint_key
 
 router = APIRouter(tags=["reconstructions"])
@@ -192,7 +193,7 @@ def _queue(
             params=params,
         )
         accepted = idempotent.accept_job(session, job)
-    gateway.wakeups.send()
+    gateway.wakeups.send(JobMessage.of(job, map_name))
     return accepted
 
 

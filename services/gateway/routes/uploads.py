@@ -33,6 +33,7 @@ from shared.imaging.photo_header import MAX_ALTITUDE_M
 from shared.ingest.store_photo import StoreResult, insert_photo
 from shared.ingest.validation import check_photo_signature, validate_photo
 from shared.jobs import Job, JobState
+from shared.jobs.wakeups import JobMessage
 from shared.storage.keys import new_original_key
 
 router = APIRouter(tags=["photos"])
@@ -185,14 +186,14 @@ def _store_upload(
             stored = insert_photo(session, map_name, photo)
             outcome = UploadOutcome.of(stored, stored.job, upload.key, map_name)
             idempotent.store_response(session, outcome.status, outcome.body, outcome.headers)
-    finish_upload(gateway, stored, upload.key)
+    finish_upload(gateway, stored, upload.key, map_name)
     return stored
 
 
-def finish_upload(gateway: GatewayContext, stored: StoreResult, key: str) -> None:
-    """After the commit: wake the extractors, and delete received bytes that the map has."""
-    if stored.queued:
-        gateway.wakeups.send()
+def finish_upload(gateway: GatewayContext, stored: StoreResult, key: str, map_name: str) -> None:
+    """After the commit: send the job's message, and delete received bytes that the map has."""
+    if stored.queued and stored.job is not None:
+        gateway.wakeups.send(JobMessage.of(stored.job, map_name, stored.photo.filename))
     if stored.photo.object_key != key:
         gateway.store.delete(key)
 

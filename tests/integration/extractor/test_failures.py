@@ -112,9 +112,9 @@ def test_a_crash_between_chunk_and_commit_leaves_an_orphan_that_is_collected(
     orphans = averages.keys("chunks/")
     assert len(orphans) == 3  # rows, manifest and local features
     assert averages.rows() == {}
-    assert reclaim_leases(averages.catalog) == 0  # the lease has to expire first
+    assert reclaim_leases(averages.catalog, averages.wakeups) == 0  # the lease has to expire first
     expire_lease(averages.catalog, *(averages.job_of(p).id for p in photo_ids))
-    assert reclaim_leases(averages.catalog) == 2
+    assert reclaim_leases(averages.catalog, averages.wakeups) == 2
     _drain(make_worker())
     assert set(averages.rows()) == set(photo_ids)
     live = averages.keys("")
@@ -151,7 +151,7 @@ def test_leases_end_when_the_catalog_becomes_unreachable_during_a_drain(
     monkeypatch.undo()
     assert len(averages.rows()) == 4
     expire_lease(averages.catalog, *(averages.job_of(p).id for p in photo_ids[4:]))
-    reclaim_leases(averages.catalog)
+    reclaim_leases(averages.catalog, averages.wakeups)
     averages.drain()
     assert set(averages.rows()) == set(photo_ids)
 
@@ -168,7 +168,7 @@ def test_nothing_of_a_batch_is_committed_once_its_lease_was_taken_over(
     def take_over() -> None:
         jobs = [averages.job_of(photo_id).id for photo_id in photo_ids]
         expire_lease(averages.catalog, *jobs)
-        assert reclaim_leases(averages.catalog) == 3
+        assert reclaim_leases(averages.catalog, averages.wakeups) == 3
         _drain(quick)
         seen.append(averages.keys("chunks/"))
 
