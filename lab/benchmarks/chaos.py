@@ -54,6 +54,8 @@ class Fault:
     end: Callable[[Fleet], object]
     lasts: bool = False
     """Whether it is repaired after the seconds of the run, or at once"""
+    seconds: float | None = None
+    """Its own duration, where others would not show the same"""
 
     @contextlib.contextmanager
     def inject(self, fleet: Fleet, seconds: float) -> Iterator[None]:
@@ -61,7 +63,7 @@ class Fault:
         self.begin(fleet)
         try:
             yield
-            time.sleep(seconds if self.lasts else 0)
+            time.sleep(self.seconds or (seconds if self.lasts else 0))
         finally:
             self.end(fleet)
 
@@ -75,6 +77,10 @@ def all_faults() -> list[Fault]:
         _pause("a search worker stands still", "search-0-0"),
         Fault("FLUSHALL", _flush, _flush),
         _stop("Redis stopped", "Redis"),
+        _stop("Redis stopped for two minutes", "Redis", 120.0),
+        # Shorter than a socket's timeout, longer, and longer than everything.
+        *(_freeze_redis(seconds) for seconds in (7.0, 16.0, 90.0)),
+        Fault("Redis full (noeviction)", fill_redis, empty_redis, lasts=True),
         _duplicate_messages(),
         Fault("PostgreSQL killed and started", _restart_postgres, lambda fleet: None),
         _stop("PostgreSQL stopped", "PostgreSQL"),
@@ -102,13 +108,35 @@ def _pause(title: str, name: str) -> Fault:
     return Fault(title, lambda fleet: fleet[name].signal(signal.SIGSTOP), resume)
 
 
-def _stop(title: str, server: str) -> Fault:
+def _stop(title: str, server: str, seconds: float | None = None) -> Fault:
     return Fault(
         title,
         lambda fleet: fleet.servers.processes[server].kill(),
         lambda fleet: fleet.servers.processes[server].start(),
         lasts=True,
+        seconds=seconds,
     )
+
+
+def _freeze_redis(seconds: float) -> Fault:
+    return Fault(
+        f"Redis stands still for {seconds:g} s",
+        lambda fleet: fleet.servers.processes["Redis"].pause(),
+        lambda fleet: fleet.servers.processes["Redis"].resume(),
+        seconds=seconds,
+    )
+
+
+def fill_redis(fleet: Fleet) -> None:
+    """Make Redis refuse what needs memory, as its `noeviction` policy does at `maxmemory`."""
+    with Redis.from_url(fleet.servers.redis.url) as client:
+        client.config_set("maxmemory-policy", "noeviction")
+        client.config_set("maxmemory", "1")
+
+
+def empty_redis(fleet: Fleet) -> None:
+    with Redis.from_url(fleet.servers.redis.url) as client:
+        client.config_set("maxmemory", "0")
 
 
 def _restart_postgres(fleet: Fleet) -> None:

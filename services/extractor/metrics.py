@@ -56,6 +56,9 @@ class ExtractorMetrics:
             "until an operator acts; crashed: back in the queue, alone.",
             ["kind", "outcome"],
         )
+        self._failures = counter(
+            "failures", "Failed jobs by the code of the error.", ["kind", "code"]
+        )
         self._stage_seconds = histogram(
             "stage_seconds",
             "Duration of a batch's stages in seconds.",
@@ -89,6 +92,8 @@ class ExtractorMetrics:
         """Record the outcomes of a batch and the seconds of its steps."""
         for outcome, jobs in (+batch.outcomes).items():
             self._jobs.labels(batch.kind, outcome).inc(jobs)
+        for code, jobs in (+batch.reasons).items():
+            self._failures.labels(batch.kind, code).inc(jobs)
         for step, seconds in batch.seconds.items():
             self._stage_seconds.labels(step).observe(seconds)
 

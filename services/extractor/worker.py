@@ -44,10 +44,12 @@ from shared.catalog.jobs import (
     JobKind,
     WaitingFor,
 )
+from shared.catalog.processes import PROCESS_HEARTBEAT_SECONDS, list_processes
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
 from shared.jobs import Job, Priority, Wakeups
-from shared.jobs.claim import mark_started
+from shared.jobs.claim import fair_batch_size, mark_started
+from shared.jobs.queue_depth import PolledValue
 from shared.jobs.runner import JobRunner, job_trace_context
 from shared.jobs.transitions import make_waiting_jobs_claimable
 from shared.storage import ObjectStore
@@ -100,6 +102,9 @@ class ExtractorWorker:
         self._query_executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="queries")
         self._publish_executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="publish")
         self._pending_publish: Future[None] | None = None
+        self._extractors = PolledValue(
+            (lambda: 1) if only_worker else self._count_extractors, PROCESS_HEARTBEAT_SECONDS
+        )
 
     def state(self) -> dict[str, Any]:
         """Return the device, and the models with their errors, as the process registers them."""
@@ -176,7 +181,7 @@ class ExtractorWorker:
         """Claim the next batch and begin to prepare it."""
         self._heartbeat.beat()  # for each batch: a drain may last for several
         claimed = self._runner.claim(
-            self.context.settings.batch_photos, min_priority, alone=alone, started=False
+            self._fair_batch_size(), min_priority, alone=alone, started=False
         )
         if claimed is None:
             return None
@@ -186,6 +191,16 @@ class ExtractorWorker:
         batch.stages = HANDLERS[batch.kind](self.context, batch)
         batch.prepared = self._prepare_executor.submit(self._prepare, batch)
         return batch
+
+    def _fair_batch_size(self) -> int:
+        limit, workers = self.context.settings.batch_photos, self._extractors.get()
+        waiting = self._runner.count_waiting(2 * workers * limit) if workers > 1 else 0
+        return fair_batch_size(waiting, workers, limit)
+
+    def _count_extractors(self) -> int:
+        with self.context.catalog.read() as session:
+            found = list_processes(session)
+        return sum(process.role == "extractor" and process.is_live for process in found)
 
     def _prepare(self, batch: JobBatch) -> bool:
         with job_trace_context(batch.jobs, "prepare"):

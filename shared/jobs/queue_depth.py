@@ -122,13 +122,14 @@ def measure_queue_depth(session: Session, limit: int) -> QueueDepth:
 
 def _oldest_seconds(session: Session) -> float:
     """Age of the oldest claimable job of an extractor, by the index that claims use."""
-    now = session.scalars(select(db_now())).one()
-    assert now is not None, "the clock has a time"
-    oldest = now
+    ages = [0.0]
     for priority in Priority:
-        of_priority = select(Job.created_at).where(claimable_condition(), Job.priority == priority)
-        oldest = min(oldest, session.scalar(of_priority.order_by(Job.id).limit(1)) or now)
-    return (now - oldest).total_seconds()
+        of_priority = select(Job.created_at, db_now()).where(
+            claimable_condition(), Job.priority == priority
+        )
+        for created_at, now in session.execute(of_priority.order_by(Job.id).limit(1)):
+            ages.append((now - created_at).total_seconds())
+    return max(ages)
 
 
 def _usual_seconds(session: Session) -> float:
@@ -142,7 +143,9 @@ def _usual_seconds(session: Session) -> float:
         .order_by(Job.finished_at.desc())
         .limit(USUAL_JOBS)
     )
-    seconds = [(end - begin).total_seconds() for begin, end in session.execute(ended) if begin]
+    seconds = [
+        (end - begin).total_seconds() for begin, end in session.execute(ended) if begin and end
+    ]
     return sum(seconds) / len(seconds) if seconds else 0.0
 
 

@@ -25,8 +25,9 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, TypeVar
 from uuid import UUID
@@ -36,10 +37,10 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from shared.catalog.batch_items import has_batch_items
-from shared.catalog.database.base import db_now
+from shared.catalog.database.base import count_rows, db_now
 from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.session import IDLE_SECONDS, Catalog, ChangePoll
-from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState
+from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState, claimable_condition
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, Unavailable
 from shared.jobs.claim import claim_jobs, has_claimable_jobs
@@ -81,6 +82,8 @@ class ClaimedJobs:
     lease: contextlib.ExitStack
     failed: int = 0
     """Number of jobs that a step has failed because of a PlacewiseError."""
+    reasons: Counter[str] = field(default_factory=Counter)
+    """Number of jobs that failed, by the code of the error."""
 
     @property
     def token(self) -> UUID:
@@ -194,6 +197,12 @@ class JobRunner:
         with self.catalog.read() as session:
             return has_claimable_jobs(session, self.kinds, min_priority, alone=alone)
 
+    def count_waiting(self, limit: int) -> int:
+        """Count the jobs that `claim` could claim, up to `limit`."""
+        waiting = select(Job.id).where(claimable_condition(self.kinds))
+        with self.catalog.read() as session:
+            return count_rows(session, waiting, limit)
+
     def claim(
         self,
         limit: int = 1,
@@ -261,6 +270,7 @@ class JobRunner:
                     claimed, lambda session, job: _fail_or_requeue(session, job, refusal)
                 )
                 claimed.failed = sum(job.state == JobState.FAILED for job in updated)
+                claimed.reasons[error.code] += claimed.failed
             except Exception as error:
                 outcome, event = StepOutcome.CRASHED, f"crashed ({type(error).__name__})"
                 log.exception("%s: crashed", jobs)

@@ -32,7 +32,8 @@ from services.gateway.schemas import JobResponse, JobsResponse
 from shared.catalog.database.errors import to_unavailable
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, UNFINISHED_STATES, get_job, list_jobs
 from shared.catalog.maps import get_map
-from shared.jobs import JobKind, JobState
+from shared.catalog.photos import read_filenames
+from shared.jobs import Job, JobKind, JobState
 from shared.jobs.model_changes import cancel_model_change
 from shared.jobs.transitions import cancel_batch, cancel_job, retry_batch, retry_job
 from shared.jobs.wakeups import read_job_messages, report_jobs
@@ -57,10 +58,10 @@ def read_jobs(gateway: GatewayDep, query: Annotated[JobsParams, Query()]) -> Job
         jobs = list_jobs(
             session, map_id, query.state or [], query.kind or [], query.limit + 1, before
         )
+        names = read_filenames(session, {job.photo_id for job in jobs})
     page, next_cursor = query.split(jobs)
-    return JobsResponse(
-        jobs=[JobResponse.of(job, query.map) for job in page], next_cursor=next_cursor
-    )
+    responses = [JobResponse.of(job, query.map, names.get(job.photo_id)) for job in page]
+    return JobsResponse(jobs=responses, next_cursor=next_cursor)
 
 
 class JobStatusParams(MapParams):
@@ -76,7 +77,16 @@ async def read_job_status(
     if query.wait and job.state in UNFINISHED_STATES:
         seconds = min(query.wait, MAX_WAIT_SECONDS)
         job = await wait_for_job(gateway, job_id, seconds) or job
-    return JobResponse.of(job, query.map)
+    return await run_in_threadpool(_job_response, gateway, job, query.map)
+
+
+def _read_filename(session: Session, job: Job) -> str | None:
+    return read_filenames(session, [job.photo_id]).get(job.photo_id)
+
+
+def _job_response(gateway: GatewayContext, job: Job, map_name: str) -> JobResponse:
+    with gateway.catalog.read() as session:
+        return JobResponse.of(job, map_name, _read_filename(session, job))
 
 
 async def _hold_event_stream(request: Request, admission: AdmissionDep) -> AsyncIterator[None]:
@@ -100,8 +110,9 @@ async def stream_job_events(
     If too many streams are open (429, `too_many_event_streams`), poll the job instead.
     """
     job = await run_in_threadpool(load_job_of_map, gateway, query.map, job_id)
+    response = await run_in_threadpool(_job_response, gateway, job, query.map)
     return StreamingResponse(
-        _events(gateway, job_id, JobResponse.of(job, query.map), query.map),
+        _events(gateway, job_id, response, query.map),
         media_type="text/event-stream",
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
@@ -123,7 +134,7 @@ def cancel_job_by_id(
             cancel_job(job)
         session.flush()
         session.refresh(job)
-        response = JobResponse.of(job, query.map)
+        response = JobResponse.of(job, query.map, _read_filename(session, job))
         idempotent.store_response(session, 200, response)
         return response
 
@@ -145,7 +156,7 @@ def retry_job_by_id(
             retry_job(session, job)
         session.flush()
         session.refresh(job)
-        response = JobResponse.of(job, query.map)
+        response = JobResponse.of(job, query.map, _read_filename(session, job))
         idempotent.store_response(session, 200, response)
         messages = read_job_messages(session, [job.id])
     report_jobs(gateway.catalog, gateway.wakeups, [job.id])
@@ -179,4 +190,4 @@ async def _events(
                 await asyncio.sleep(CATALOG_RETRY_SECONDS)
         if change is None:
             return
-        job, last_seen = JobResponse.of(change.job, map_name), change.state
+        job, last_seen = JobResponse.of(change.job, map_name, job.filename), change.state

@@ -1,0 +1,189 @@
+"""Redis that stands still, is killed or full under load: photos are described, queries answered.
+
+`placewise bench chaos` has the longer outages (90 s, two minutes).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from typing import Self
+from uuid import UUID
+
+import httpx2
+import pytest
+from redis import Redis
+from sqlalchemy import func, select
+
+from lab.benchmarks.chaos import empty_redis, fill_redis
+from lab.benchmarks.fleet import Fleet, open_fleet
+from lab.benchmarks.invariants import check_invariants, count_unfinished_jobs
+from shared.jobs import Job
+from shared.jobs.wakeups import WakeupQueue
+from tests.support.photos import photo_bytes
+from tests.support.server import SERVICES_KEY
+
+PHOTOS_PER_SECOND = 4.0
+BEFORE_SECONDS = 10.0
+RECOVERY_SECONDS = 15.0
+END_SECONDS = 120.0  # until a backlog of the load is described, on a busy machine
+
+pytestmark = [pytest.mark.servers, pytest.mark.timeout(900)]
+
+
+@pytest.fixture(scope="module")
+def fleet() -> Iterator[Fleet]:
+    with open_fleet(
+        gateways=1,
+        extractors=2,
+        shards=1,
+        executed=False,
+        extractor="test-slow-avg:milliseconds=5,width=256",
+        lease_seconds=5.0,
+        batch_photos=8,
+    ) as opened:
+        opened.start()
+        yield opened
+
+
+class Load:
+    """Uploads photos at a steady rate, and asks with one of them every second."""
+
+    def __init__(self, fleet: Fleet, numbers: Iterator[int]) -> None:
+        self._fleet = fleet
+        self._numbers = numbers
+        self._stop = threading.Event()
+        self.acknowledged: dict[str, UUID] = {}
+        self.unanswered: list[str] = []
+        self._threads = [threading.Thread(target=run) for run in (self._upload, self._ask)]
+
+    def __enter__(self) -> Self:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        for thread in self._threads:
+            thread.join()
+
+    def _client(self) -> httpx2.Client:
+        headers = {"Authorization": f"Bearer {SERVICES_KEY}"}
+        return httpx2.Client(base_url=self._fleet.gateway_urls[0], headers=headers, timeout=30)
+
+    def _upload(self) -> None:
+        with self._client() as client:
+            while not self._stop.wait(1 / PHOTOS_PER_SECOND):
+                number = next(self._numbers)
+                data = photo_bytes(number)
+                answer = client.post("/api/v1/upload", files={"file": (f"{number}.jpg", data)})
+                assert answer.status_code == 202, answer.text
+                self.acknowledged[hashlib.sha256(data).hexdigest()] = UUID(answer.json()["file_id"])
+
+    def _ask(self) -> None:
+        with self._client() as client:
+            while not self._stop.wait(1.0):
+                answer = client.post(
+                    "/api/v1/similarity",
+                    files={"file": ("query.jpg", photo_bytes(0))},
+                    headers={"Prefer": "wait=20"},
+                )
+                if answer.status_code != 200:
+                    self.unanswered.append(answer.text)
+
+
+def finished_per_second(fleet: Fleet, begin: datetime, end: datetime) -> float:
+    with fleet.catalog.read() as session:
+        count = session.scalar(
+            select(func.count()).where(Job.finished_at > begin, Job.finished_at <= end)
+        )
+    return (count or 0) / (end - begin).total_seconds()
+
+
+@contextlib.contextmanager
+def frozen(fleet: Fleet) -> Iterator[None]:
+    fleet.servers.processes["Redis"].pause()
+    try:
+        yield
+    finally:
+        fleet.servers.processes["Redis"].resume()
+
+
+@contextlib.contextmanager
+def killed(fleet: Fleet) -> Iterator[None]:
+    fleet.servers.processes["Redis"].kill()
+    try:
+        yield
+    finally:
+        fleet.servers.processes["Redis"].start()
+
+
+@contextlib.contextmanager
+def full(fleet: Fleet) -> Iterator[None]:
+    fill_redis(fleet)
+    try:
+        yield
+    finally:
+        empty_redis(fleet)
+
+
+numbers = itertools.count()
+acknowledged: dict[str, UUID] = {}
+
+
+@pytest.mark.parametrize(
+    ("outage", "seconds"), [(frozen, 7.0), (frozen, 16.0), (killed, 20.0), (full, 10.0)]
+)
+def test_photos_are_described_and_queries_answered_while_redis_is_away(
+    fleet: Fleet,
+    outage: Callable[[Fleet], contextlib.AbstractContextManager[None]],
+    seconds: float,
+) -> None:
+    crashed = len(fleet.crashed)
+    with Load(fleet, numbers) as load:
+        time.sleep(BEFORE_SECONDS)
+        begun = datetime.now(UTC)
+        with outage(fleet):
+            time.sleep(seconds)
+            health = httpx2.get(
+                f"{fleet.gateway_urls[0]}/api/v1/health",
+                headers={"Authorization": f"Bearer {SERVICES_KEY}"},
+                timeout=30,
+            ).json()
+        repaired = datetime.now(UTC)
+        time.sleep(2 * RECOVERY_SECONDS)
+        ended = datetime.now(UTC)
+    recovered = repaired + timedelta(seconds=RECOVERY_SECONDS)
+    before, during, after = (
+        finished_per_second(fleet, *window)
+        for window in (
+            (begun - timedelta(seconds=BEFORE_SECONDS / 2), begun),
+            (begun, repaired),
+            (recovered, ended),
+        )
+    )
+    print(
+        f"{outage.__name__} {seconds:g} s: {before:.1f}, {during:.1f}, {after:.1f} jobs/s, "
+        f"{len(load.unanswered)} queries without an answer"
+    )
+    assert fleet.crashed[crashed:] == []
+    assert load.unanswered == []
+    assert during > 0.5 * before
+    assert after > 0.7 * before
+    assert health["parts"]["queue"]["status"] == "degraded", health
+    assert health["parts"]["extractors"]["status"] == "healthy", health
+    deadline = time.monotonic() + END_SECONDS
+    while count_unfinished_jobs(fleet.catalog) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    acknowledged.update(load.acknowledged)
+    counts = check_invariants(fleet.catalog, fleet.store, acknowledged)
+    assert counts.none_found, counts
+    with Redis.from_url(fleet.servers.redis.url) as client:
+        while any(client.llen(queue) for queue in WakeupQueue) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        assert not any(client.llen(queue) for queue in WakeupQueue)
