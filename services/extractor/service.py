@@ -54,12 +54,12 @@ def _run_extractor(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     with (
+        serve_metrics(settings, registry),
         contextlib.closing(CeleryWakeups(app, settings, name)) as wakeups,
         contextlib.closing(
             ExtractorWorker(catalog, store, settings, name, registry=registry, wakeups=wakeups)
         ) as worker,
         process_heartbeat(catalog, "extractor", worker.state),
-        serve_metrics(settings, registry),
     ):
         node = CeleryNode(app, settings, name, wakeups, worker.state)
 

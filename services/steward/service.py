@@ -41,12 +41,12 @@ def serve_steward(settings: Settings, announce: Announce) -> None:
         process_heartbeat(catalog, "steward"),
         contextlib.closing(CeleryWakeups(create_celery_app(settings), settings)) as wakeups,
         HttpSearchClient.from_settings(settings) as search,
+        serve_metrics(settings, registry := CollectorRegistry()),
     ):
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
         store = open_installation_store(catalog, settings, exclusive=False)
         name = f"steward-{socket.gethostname()}-{os.getpid()}"
-        registry = CollectorRegistry()
         metrics = StewardMetrics(registry)
         batches = BatchWorker(catalog, store, wakeups, settings, name, metrics)
         scheduler = Scheduler(catalog, store, wakeups, settings, metrics)
@@ -62,8 +62,7 @@ def serve_steward(settings: Settings, announce: Announce) -> None:
             stop,
         )
         announce("Placewise steward is running")
-        with serve_metrics(settings, registry):
-            while not stop.wait(SIGNAL_POLL_SECONDS):
-                pass
-            for thread in threads:
-                thread.join()
+        while not stop.wait(SIGNAL_POLL_SECONDS):
+            pass
+        for thread in threads:
+            thread.join()

@@ -118,7 +118,7 @@ function phoneCard({ lan_url: lanUrl }) {
       ? h("div", { class: "phone-address" },
         h("img", { src: `/console/qr.svg?url=${encodeURIComponent(url)}`, alt: `QR code of ${url}`, width: "180", height: "180" }),
         h("div", {}, h("p", {}, "Scan this code with the camera of a phone in the same network, or open ", h("a", { href: url }, url), " there."), h("p", { class: "soft" }, "The phone asks for the key once, and can remember it.")))
-      : h("p", {}, "Only this machine can reach this server. To use it from a phone, start it with ", h("code", {}, "make run HOST=0.0.0.0"), ". Every call then needs a key, which the first start prints."),
+      : h("p", {}, "Only this machine can reach this server. To use it from a phone, start it for the network: ", h("code", {}, "make run HOST=0.0.0.0"), ", or with Docker Compose ", h("code", {}, "BIND=0.0.0.0"), ". Every call then needs a key."),
     hasKey() && h("p", { class: "row" }, "This browser has a key. ", button("Forget the key", () => {
       forgetKey();
       location.reload();
