@@ -10,7 +10,6 @@ import contextlib
 import logging
 import os
 import platform
-import resource
 import threading
 import time
 from collections.abc import Callable, Generator, Mapping
@@ -141,8 +140,6 @@ class CeleryNode:
         self._wakeups.send_event(
             event,
             freq=HEARTBEAT_SECONDS,
-            active=len(self._wakeups.active),
-            processed=self._wakeups.processed.total(),
             loadavg=load_average(),
             sw_ident="placewise",
             sw_ver=version("placewise"),
@@ -151,48 +148,35 @@ class CeleryNode:
         )
 
     def _handlers(self, connection: Connection) -> dict[str, Callable[..., Any]]:
-        def ignore(_state: object, **_: object) -> dict[str, str]:
-            return {"ok": "events are always on"}
-
         answers: dict[str, Callable[[], Any]] = {
             "ping": lambda: {"ok": "pong"},
             "stats": lambda: self._stats(connection),
             "active_queues": lambda: [_describe_queue(queue) for queue in WakeupQueue],
             "registered": lambda: [task_name(kind) for kind in EXTRACTOR_JOBS],
-            "active": lambda: list(self._wakeups.active.values()),
-            "scheduled": list,
-            "reserved": list,
-            "revoked": list,
-            "conf": dict,
+            "conf": lambda: self._settings.model_dump(
+                mode="json", include={"batch_photos", "device"}
+            ),
+            # Jobs that run are in Flower's list of tasks; none is held back here.
+            **dict.fromkeys(("active", "scheduled", "reserved", "revoked"), list),
+            # Events are always on.
+            **dict.fromkeys(("enable_events", "disable_events"), dict),
         }
-        answering = {
+        return {
             name: lambda _state, _answer=answer, **_: _answer() for name, answer in answers.items()
         }
-        return {**answering, "enable_events": ignore, "disable_events": ignore}
 
     def _stats(self, connection: Connection) -> dict[str, Any]:
-        usage = resource.getrusage(resource.RUSAGE_SELF)
         return {
             **self._read_state(),
-            "total": dict(self._wakeups.processed),
+            "total": {},
             "pid": os.getpid(),
-            "prefetch_count": self._settings.batch_photos,
             "uptime": round(time.monotonic() - self._started),
-            "pool": {"max-concurrency": 1, "implementation": "placewise: batches by model"},
+            "pool": {"implementation": "batches of jobs of one model"},
             "broker": {"hostname": connection.hostname, "transport": "redis"},
-            "rusage": {"utime": usage.ru_utime, "stime": usage.ru_stime, "maxrss": usage.ru_maxrss},
         }
 
 
 def _describe_queue(queue: WakeupQueue) -> dict[str, Any]:
-    return {
-        "name": queue,
-        "routing_key": queue,
-        "durable": True,
-        "no_ack": True,
-        "exclusive": False,
-        "auto_delete": False,
-        "alias": None,
-        "queue_arguments": None,
-        "binding_arguments": None,
-    }
+    flags = dict.fromkeys(("exclusive", "auto_delete"), False)
+    unset = dict.fromkeys(("alias", "queue_arguments", "binding_arguments"))
+    return {"name": queue, "routing_key": queue, "durable": True, "no_ack": True, **flags, **unset}

@@ -33,7 +33,7 @@ from services.extractor.added_models import AddedModelLoader
 from services.extractor.decoder_pool import DecoderPool
 from services.extractor.fits import ComputeFit, FitWorker, compute_in_child
 from services.extractor.generation_resolver import reindex_outdated_generations
-from services.extractor.handlers import HANDLERS, DrainStats, ExtractorContext, JobBatch
+from services.extractor.handlers import HANDLERS, ExtractorContext, JobBatch
 from services.extractor.metrics import ExtractorMetrics
 from services.extractor.model_registry import ModelRegistry
 from shared.catalog.database.session import Catalog
@@ -132,7 +132,7 @@ class ExtractorWorker:
 
         Fits run in a thread of their own (`fits`).
         """
-        self._runner.run(lambda: self.drain(stop).claimed > 0, stop, wait)
+        self._runner.run(lambda: self.drain(stop), stop, wait)
 
     def close(self) -> None:
         """Stop the threads and decoders; claimed jobs are requeued when their lease expires."""
@@ -141,12 +141,11 @@ class ExtractorWorker:
         self._prepare_executor.shutdown(wait=True, cancel_futures=True)
         self.context.decoders.close()
 
-    def drain(self, stop: threading.Event) -> DrainStats:
-        """Process jobs until none is claimable, or `stop` is set."""
-        stats = DrainStats()
-        current, upcoming = None, self._claim(stats)
+    def drain(self, stop: threading.Event) -> bool:
+        """Process jobs until none is claimable, or `stop` is set; return whether there was one."""
+        current, upcoming = None, self._claim()
         if upcoming is None:
-            return stats
+            return False
         with self._metrics.measure_drain():
             try:
                 while upcoming is not None:
@@ -156,28 +155,25 @@ class ExtractorWorker:
                         break
                     current = upcoming
                     # Claimed before the forward pass, so that its photos are decoded meanwhile.
-                    upcoming = self._claim(stats)
+                    upcoming = self._claim()
                     if not _is_query(current):
                         # Otherwise the query would wait for this batch and the one being published.
                         while upcoming is not None and _is_query(upcoming) and not stop.is_set():
-                            self._process(upcoming, stats, stop)
-                            upcoming = self._claim(stats)
-                    self._process(current, stats, stop)
+                            self._process(upcoming, stop)
+                            upcoming = self._claim()
+                    self._process(current, stop)
                     if upcoming is None:
                         self._wait_for_publish()  # which may requeue jobs
-                        upcoming = self._claim(stats)
+                        upcoming = self._claim()
             finally:
                 # Without the catalog, claimed jobs are requeued when their lease expires.
                 for unfinished in (current, upcoming):
                     if unfinished is not None:
                         unfinished.lease.close()
                 self._wait_for_publish()
-        log.info("drained: %s", stats.as_dict())
-        return stats
+        return True
 
-    def _claim(
-        self, stats: DrainStats, min_priority: int | None = None, *, alone: bool = True
-    ) -> JobBatch | None:
+    def _claim(self, min_priority: int | None = None, *, alone: bool = True) -> JobBatch | None:
         """Claim the next batch and begin to prepare it."""
         self._heartbeat.beat()  # for each batch: a drain may last for several
         claimed = self._runner.claim(
@@ -186,7 +182,6 @@ class ExtractorWorker:
         if claimed is None:
             return None
         self._metrics.observe_claim(claimed.kind, len(claimed.jobs))
-        stats.add_claim(claimed.jobs)
         batch = JobBatch(claimed.jobs, claimed.lease)
         batch.stages = HANDLERS[batch.kind](self.context, batch)
         batch.prepared = self._prepare_executor.submit(self._prepare, batch)
@@ -206,21 +201,20 @@ class ExtractorWorker:
         with job_trace_context(batch.jobs, "prepare"):
             return next(batch.stages, DONE) is not DONE
 
-    def _process(self, batch: JobBatch, stats: DrainStats, stop: threading.Event) -> None:
+    def _process(self, batch: JobBatch, stop: threading.Event) -> None:
         """Describe and publish a batch, beside as little else as it allows."""
         if _runs_exclusively(batch):
             self._wait_for_publish()
-            self._run(batch, stats)
+            self._run(batch)
         elif _is_query(batch):
-            self._run(batch, stats, 0 if self._pending_publish is None else 1)
+            self._run(batch, 0 if self._pending_publish is None else 1)
         else:
-            with self._answering_queries(stats, stop):
-                self._run(batch, stats, 1, publish_later=True)
+            with self._answering_queries(stop):
+                self._run(batch, 1, publish_later=True)
 
     def _run(
         self,
         batch: JobBatch,
-        stats: DrainStats,
         concurrent_jobs: int = 0,
         *,
         publish_later: bool = False,
@@ -231,16 +225,16 @@ class ExtractorWorker:
         of a crash. With `publish_later`, the batch is published while the model runs the next one.
         """
         with batch.lease:
-            if not self._describe(batch, stats, concurrent_jobs):
+            if not self._describe(batch, concurrent_jobs):
                 return
             if not publish_later:
-                self._publish(batch, stats)
+                self._publish(batch)
                 return
             self._wait_for_publish()
             described = replace(batch, lease=batch.lease.pop_all())
-            self._pending_publish = self._publish_executor.submit(self._publish, described, stats)
+            self._pending_publish = self._publish_executor.submit(self._publish, described)
 
-    def _describe(self, batch: JobBatch, stats: DrainStats, concurrent_jobs: int) -> bool:
+    def _describe(self, batch: JobBatch, concurrent_jobs: int) -> bool:
         """Run the stage of the batch that needs the model; return whether one follows."""
         with self._runner.step(batch, "describe"):
             if batch.prepared.result():
@@ -250,24 +244,23 @@ class ExtractorWorker:
                 self._runner.report_started(batch)
                 if next(batch.stages, DONE) is not DONE:
                     return True
-        self._record(batch, stats)
+        self._record(batch)
         return False
 
-    def _publish(self, batch: JobBatch, stats: DrainStats) -> None:
+    def _publish(self, batch: JobBatch) -> None:
         with batch.lease, self._runner.step(batch, "publish"):
             next(batch.stages, DONE)
-        self._record(batch, stats)
+        self._record(batch)
 
-    def _record(self, batch: JobBatch, stats: DrainStats) -> None:
-        stats.add_batch(batch)
+    def _record(self, batch: JobBatch) -> None:
         self._metrics.observe_batch(batch)
         self._runner.report_ended(batch)
 
     @contextlib.contextmanager
-    def _answering_queries(self, stats: DrainStats, stop: threading.Event) -> Iterator[None]:
+    def _answering_queries(self, stop: threading.Event) -> Iterator[None]:
         """Describe queries in another thread while the block describes a bulk batch."""
         done = threading.Event()
-        queries = self._query_executor.submit(self._poll_queries, done, stop, stats)
+        queries = self._query_executor.submit(self._poll_queries, done, stop)
         try:
             yield
         finally:
@@ -275,17 +268,15 @@ class ExtractorWorker:
             wait([queries])
         queries.result()
 
-    def _poll_queries(
-        self, done: threading.Event, stop: threading.Event, stats: DrainStats
-    ) -> None:
+    def _poll_queries(self, done: threading.Event, stop: threading.Event) -> None:
         while not (done.is_set() or stop.is_set()):
             query = None
             if self._runner.has_jobs(Priority.QUERY, alone=False):
-                query = self._claim(stats, Priority.QUERY, alone=False)
+                query = self._claim(Priority.QUERY, alone=False)
             if query is None:
                 done.wait(QUERY_POLL_SECONDS)
             else:
-                self._run(query, stats, 1)
+                self._run(query, 1)
 
     def _wait_for_publish(self) -> None:
         pending, self._pending_publish = self._pending_publish, None

@@ -16,11 +16,10 @@ import contextlib
 import itertools
 import json
 import logging
-import os
 import socket
 import threading
 import time
-from collections import Counter, defaultdict, deque
+from collections import defaultdict, deque
 from typing import Any
 from uuid import UUID
 
@@ -114,10 +113,6 @@ class CeleryWakeups:
         self.problem: str | None = None
         self.answers_since: float | None = None
         """Since when Redis takes what is sent (monotonic)."""
-        self.active: dict[UUID, dict[str, Any]] = {}
-        """The jobs that this worker has claimed, as `celery inspect active` shows them."""
-        self.processed: Counter[str] = Counter()
-        """Number of jobs that this worker has claimed, by task."""
         self._sender = threading.Thread(target=self._run, name="wakeups", daemon=True)
         self._sender.start()
 
@@ -129,15 +124,6 @@ class CeleryWakeups:
     def claimed(self, *jobs: JobMessage) -> None:
         self._withdrawn.extend(jobs)
         for job in jobs:
-            self.processed[job.task] += 1
-            self.active[job.id] = {
-                "id": str(job.id),
-                "name": job.task,
-                "args": [],
-                "kwargs": _arguments(job),
-                "acknowledged": True,
-                "worker_pid": os.getpid(),
-            }
             self.send_event("task-received", **_describe(job))
 
     def started(self, *jobs: Job) -> None:
@@ -146,7 +132,6 @@ class CeleryWakeups:
 
     def report(self, *jobs: Job) -> None:
         for job in jobs:
-            self.active.pop(job.id, None)
             if job.lease_token is not None:
                 continue  # another worker has taken it over
             worker = {"hostname": job.worker} if job.worker else {}

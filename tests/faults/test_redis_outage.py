@@ -22,7 +22,6 @@ from redis import Redis
 from sqlalchemy import func, select
 from sqlalchemy.orm import InstrumentedAttribute
 
-from lab.benchmarks.chaos import empty_redis, fill_redis
 from lab.benchmarks.fleet import Fleet, open_fleet
 from lab.benchmarks.invariants import check_invariants, count_unfinished_jobs
 from shared.jobs import Job
@@ -154,11 +153,11 @@ def killed(fleet: Fleet) -> Iterator[None]:
 
 @contextlib.contextmanager
 def full(fleet: Fleet) -> Iterator[None]:
-    fill_redis(fleet)
+    fleet.servers.redis.fill()
     try:
         yield
     finally:
-        empty_redis(fleet)
+        fleet.servers.redis.empty()
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from sqlalchemy import select
 
-from services.extractor.handlers import DrainStats
 from services.extractor.worker import ExtractorWorker
 from services.steward.tasks.auto_fit import fit_due_vocabularies
 from services.steward.tasks.model_changes import advance_model_changes
@@ -105,7 +104,7 @@ class Workplace:
             self._worker = self.make_worker()
         return self._worker
 
-    def drain(self) -> DrainStats:
+    def drain(self) -> bool:
         """Do all jobs of the extractor, fits too; the result is that of the first drain."""
         stop = threading.Event()
         result = self.worker.drain(stop)

@@ -65,7 +65,7 @@ def test_each_photo_gets_its_one_row_and_the_right_one(averages: Workplace) -> N
         manifest = json.loads(averages.store.get(manifest_key(chunk.object_key)))
         assert manifest["sha256"] == chunk.sha256
         assert manifest["spec"] == averages.active().spec
-    assert averages.drain().claimed == 0
+    assert not averages.drain()
 
 
 def test_a_query_in_an_empty_map_leaves_its_row_beside_its_bytes_and_none_in_the_map(
@@ -73,7 +73,7 @@ def test_a_query_in_an_empty_map_leaves_its_row_beside_its_bytes_and_none_in_the
 ) -> None:
     data = photo_bytes(2)
     job_id = averages.ask(data)
-    assert averages.drain().succeeded == 1
+    assert averages.drain()
     reference = {
         "generation_id": str(averages.active().id),
         "object_key": query_vector_key(job_id),
