@@ -20,18 +20,18 @@ import socket
 import threading
 import time
 from collections import defaultdict, deque
+from collections.abc import Sequence
 from typing import Any
 from uuid import UUID
 
 from celery import Celery
-from celery.events.event import get_exchange
-from kombu.connection import Connection
+from celery.events.event import EVENT_EXCHANGE_NAME
 from kombu.exceptions import KombuError, OperationalError
-from kombu.messaging import Producer
 from redis import Redis
 from redis.exceptions import RedisError
 from sqlalchemy import select
 
+from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import claimable_condition
 from shared.config.settings import Settings
@@ -91,6 +91,7 @@ EVENTS_PER_MESSAGE = 500
 DEBOUNCE_SECONDS = 0.01
 PING_SECONDS = 2.0  # without anything to send
 RETRY_SECONDS = 1.0
+SETTLED_SECONDS = 2.0  # that a message may take from the commit to Redis before it counts as lost
 WARNING_INTERVAL_SECONDS = 60.0  # between two log lines about an unreachable Redis
 
 
@@ -104,6 +105,9 @@ class CeleryWakeups:
         self._app = app
         self._worker = worker or f"placewise@{socket.gethostname()}"
         self._redis = open_redis(settings)
+        database = self._redis.get_connection_kwargs()["db"]
+        self._event_channel = f"/{database}.{EVENT_EXCHANGE_NAME}/task.multi"
+        self._lengths = dict.fromkeys(WakeupQueue, 0)
         self._messages: deque[JobMessage] = deque(maxlen=MAX_PENDING)
         self._withdrawn: deque[JobMessage] = deque(maxlen=MAX_PENDING)
         self._events: deque[dict[str, Any]] = deque(maxlen=MAX_PENDING)
@@ -156,8 +160,9 @@ class CeleryWakeups:
             (malformed if job_id is None else queued[job_id]).append(message)
         with catalog.read() as session:
             claimable = select(Job.id).where(claimable_condition())
+            settled = claimable.where(Job.created_at < db_now_plus(-SETTLED_SECONDS))
             waiting = session.scalars(
-                claimable.order_by(Job.priority.desc(), Job.id).limit(MAX_QUEUED)
+                settled.order_by(Job.priority.desc(), Job.id).limit(MAX_QUEUED)
             ).all()
             missing = read_job_messages(session, [id_ for id_ in waiting if id_ not in queued])
             others = queued.keys() - set(waiting)
@@ -168,8 +173,13 @@ class CeleryWakeups:
         if malformed:
             log.warning("%d malformed messages on Redis are dropped", len(malformed))
         with contextlib.suppress(*BROKER_ERRORS), self._redis.pipeline(transaction=False) as pipe:
-            for queue, text in itertools.chain(malformed, *(queued[id_] for id_ in others)):
-                pipe.execute_command("LREM", queue, 0, text)  # type: ignore[no-untyped-call]
+            outdated = [
+                copy
+                for id_, copies in queued.items()
+                for copy in (copies if id_ in others else copies[1:])
+            ]
+            for queue, text in [*malformed, *outdated]:
+                pipe.execute_command("LREM", queue, 1, text)  # type: ignore[no-untyped-call]
             pipe.execute()
         self.report(*cancelled)
         self.send(*missing)
@@ -182,58 +192,46 @@ class CeleryWakeups:
         self._redis.close()
 
     def _run(self) -> None:
-        connection = self._app.connection_for_write()
         stopping = False
         while not stopping:
             self._any_pending.wait(PING_SECONDS)
             stopping = self._stop.wait(DEBOUNCE_SECONDS)  # what is pending is still sent
             self._any_pending.clear()
             try:
-                self._send_events(connection)
-                self._send_messages()
+                self._send_pending()
                 self.problem, self.answers_since = None, self.answers_since or time.monotonic()
             except BROKER_ERRORS as error:
                 self.problem, self.answers_since = str(error), None
-                connection.release()
                 if time.monotonic() > self._next_warning:
                     self._next_warning = time.monotonic() + WARNING_INTERVAL_SECONDS
                     log.warning("Redis takes no messages; they are dropped: %s", error)
                 self._stop.wait(RETRY_SECONDS)
-        connection.release()
 
-    def _send_events(self, connection: Connection) -> None:
-        # PUBLISH, also of a Redis that is full. Celery's dispatcher has one worker's name.
-        exchange = get_exchange(connection)
-        while events := list(itertools.islice(self._events, EVENTS_PER_MESSAGE)):
-            Producer(connection).publish(  # type: ignore[no-untyped-call]
-                events, "task.multi", exchange=exchange, declare=[exchange], delivery_mode=1
-            )
-            for _ in events:
-                self._events.popleft()
-
-    def _send_messages(self) -> None:
-        """Withdraw and send messages; those that Redis does not take are dropped."""
+    def _send_pending(self) -> None:
+        """Send what is pending; messages that Redis does not take are dropped, events are kept."""
         withdrawn, messages = _take_all(self._withdrawn), _take_all(self._messages)
+        events = list(itertools.islice(self._events, EVENTS_PER_MESSAGE))
         with self._redis.pipeline(transaction=False) as pipe:
+            if events:  # also a Redis that is full publishes them
+                pipe.publish(self._event_channel, _encode_events(events))
             for job in withdrawn:
                 pipe.lrem(job.queue, -1, encode_message(self._app, job))
+            for job in messages:
+                self._lengths[job.queue] += 1
+                if self._lengths[job.queue] <= MAX_QUEUED:
+                    pipe.lpush(job.queue, encode_message(self._app, job))
             for queue in WakeupQueue:
                 pipe.llen(queue)
-            lengths = pipe.execute()[-len(WakeupQueue) :]
-            room = {q: MAX_QUEUED - n for q, n in zip(WakeupQueue, lengths, strict=True)}
-            for job in messages:
-                room[job.queue] -= 1
-                if room[job.queue] >= 0:
-                    pipe.lpush(job.queue, encode_message(self._app, job))
-            pipe.execute()
-
-
-def _job_id(message: bytes | str) -> UUID | None:
-    """Return the job of a message; None if this is not the message of a job."""
-    try:
-        return UUID(json.loads(message)["properties"]["delivery_tag"])
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
-        return None
+            replies = pipe.execute(raise_on_error=False)
+        if events and not isinstance(replies[0], Exception):
+            for _ in events:
+                self._events.popleft()
+        if len(self._events):
+            self._any_pending.set()
+        for reply in replies:
+            if isinstance(reply, Exception):
+                raise reply
+        self._lengths = dict(zip(WakeupQueue, replies[-len(WakeupQueue) :], strict=True))
 
 
 def _take_all(pending: deque[JobMessage]) -> list[JobMessage]:
@@ -245,22 +243,42 @@ def encode_message(app: Celery, job: JobMessage) -> str:
     task = app.amqp.as_task_v2(
         str(job.id), job.task, args=(), kwargs=_arguments(job), origin="placewise"
     )
-    properties = {
-        **task.properties,
-        "delivery_mode": 2,
-        "delivery_info": {"exchange": "", "routing_key": job.queue},
-        "priority": 0,
-        "body_encoding": "base64",
-        "delivery_tag": str(job.id),
-    }
+    route = {"exchange": "", "routing_key": job.queue}
+    return _encode(task.body, task.headers, str(job.id), route, **task.properties)
+
+
+def _encode_events(events: Sequence[dict[str, Any]]) -> str:
+    route = {"exchange": EVENT_EXCHANGE_NAME, "routing_key": "task.multi"}
+    return _encode(events, {"hostname": events[0]["hostname"]}, events[0].get("uuid", ""), route)
+
+
+def _encode(
+    body: Any, headers: dict[str, Any], tag: str, route: dict[str, str], **properties: Any
+) -> str:
+    """Return a message of kombu's Redis transport."""
     message = {
-        "body": base64.b64encode(json.dumps(task.body).encode()).decode(),
+        "body": base64.b64encode(json.dumps(body).encode()).decode(),
         "content-encoding": "utf-8",
         "content-type": "application/json",
-        "headers": task.headers,
-        "properties": properties,
+        "headers": headers,
+        "properties": {
+            **properties,
+            "delivery_mode": 2,
+            "delivery_info": route,
+            "priority": 0,
+            "body_encoding": "base64",
+            "delivery_tag": tag,
+        },
     }
     return json.dumps(message)
+
+
+def _job_id(message: bytes | str) -> UUID | None:
+    """Return the job of a message; None if this is not the message of a job."""
+    try:
+        return UUID(json.loads(message)["properties"]["delivery_tag"])
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return None
 
 
 def _arguments(job: JobMessage) -> dict[str, str]:

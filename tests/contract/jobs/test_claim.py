@@ -222,7 +222,7 @@ def test_jobs_of_a_map_are_listed_newest_first_and_filtered(catalog: Catalog, ma
             get_job(session, map_id, elsewhere)
 
 
-@pytest.mark.parametrize("waiting", [10, 80, 400])
+@pytest.mark.parametrize("waiting", [40, 80, 400])
 def test_workers_share_a_burst_that_one_of_them_sees_first(waiting: int) -> None:
     """The first prefetches a batch, as extractors do, before the other comes."""
     shares = [0, 0]

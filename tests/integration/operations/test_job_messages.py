@@ -12,11 +12,11 @@ from uuid import UUID
 
 import pytest
 from celery import Celery
-from kombu import Queue
 from redis import Redis
-from sqlalchemy import func, select
+from sqlalchemy import func, select, update
 
 from services.steward.tasks.maintenance import resend_wakeups
+from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.installation import open_installation_store
 from shared.config.settings import Settings
@@ -30,7 +30,7 @@ from shared.jobs.celery_wakeups import (
     encode_message,
 )
 from shared.jobs.transitions import cancel_job
-from shared.jobs.wakeups import JobMessage, WakeupQueue
+from shared.jobs.wakeups import JobMessage, WakeupQueue, read_job_messages
 from shared.storage import FolderStore
 from shared.telemetry import celery_config
 from tests.support.catalog_rows import add_map, ask, upload
@@ -83,11 +83,11 @@ def test_celery_reads_a_message_that_names_the_job_its_map_and_its_file(
 ) -> None:
     job = message(7, JobKind.REINDEX)
     wakeups.send(job)
-    with app.connection_for_read() as connection:
-        queue = Queue(job.queue)(connection.default_channel)
-        received: list[Any] = []
-        until(lambda: received.append(queue.get(no_ack=True)) or received[-1])
-    found = received[-1]
+    with (
+        app.connection_for_read() as connection,
+        connection.SimpleQueue(job.queue, no_ack=True) as queue,
+    ):
+        found = queue.get(timeout=SECONDS)
     assert found.headers["task"] == "placewise.reindex"
     assert found.headers["id"] == str(job.id)
     arguments, named, _ = found.payload
@@ -144,7 +144,7 @@ def test_a_full_redis_takes_events_and_no_messages(
 ) -> None:
     client.config_set("maxmemory-policy", "noeviction")
     client.config_set("maxmemory", "1")
-    with client.pubsub() as listening:
+    with client.pubsub() as listening:  # type: ignore[no-untyped-call]
         listening.psubscribe("/0.celeryev/*")
         wakeups.send(message())
         until(lambda: wakeups.problem is not None and "maxmemory" in wakeups.problem)
@@ -283,15 +283,20 @@ def test_the_steward_sends_lost_messages_and_withdraws_those_of_jobs_that_wait_n
     store = FolderStore(tmp_path / "objects", exclusive=False)
     for number in range(4):
         upload(catalog_on_postgres, store, map_id, photo_bytes(number))
+    assert resend_wakeups(catalog_on_postgres, wakeups) == 0, "they may be under way"
+    with catalog_on_postgres.write() as session:
+        session.execute(update(Job).values(created_at=db_now_plus(-10)))
+        ids = session.scalars(select(Job.id)).all()
+        twice = read_job_messages(session, ids[:1])
     assert resend_wakeups(catalog_on_postgres, wakeups) == 4
     until(lambda: client.llen(WakeupQueue.BULK) == 4)
-    wakeups.send(message())  # of a job that was deleted since
-    until(lambda: client.llen(WakeupQueue.BULK) == 5)
+    wakeups.send(message(), *twice)  # the first of a job that was deleted since
+    until(lambda: client.llen(WakeupQueue.BULK) == 6)
     with catalog_on_postgres.write() as session:
         cancelled = session.scalars(select(Job).order_by(Job.id)).first()
         assert cancelled is not None
         cancel_job(cancelled)
-    with client.pubsub() as listening:
+    with client.pubsub() as listening:  # type: ignore[no-untyped-call]
         listening.psubscribe("/0.celeryev/*")
         assert resend_wakeups(catalog_on_postgres, wakeups) == 0
         assert client.llen(WakeupQueue.BULK) == 3
