@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Iterable, Iterator
 from functools import partial
 
@@ -70,11 +69,6 @@ class ExtractorMetrics:
             "Duration of loading an extractor in seconds.",
             buckets=LOAD_BUCKETS_SECONDS,
         )
-        self._drain_seconds = histogram(
-            "drain_seconds",
-            "Duration in seconds of drains that claimed jobs.",
-            buckets=STAGE_BUCKETS_SECONDS,
-        )
         self._draining = gauge("draining", "1 while the worker processes jobs.")
         registry.register(_DeviceMemoryCollector())
 
@@ -103,14 +97,9 @@ class ExtractorMetrics:
 
     @contextlib.contextmanager
     def measure_drain(self) -> Iterator[None]:
-        """Measure the duration of the block as a drain."""
-        started = time.perf_counter()
-        self._draining.set(1)
-        try:
+        """Show that the worker processes jobs while the block runs."""
+        with self._draining.track_inprogress():
             yield
-        finally:
-            self._draining.set(0)
-            self._drain_seconds.observe(time.perf_counter() - started)
 
 
 class _DeviceMemoryCollector(Collector):

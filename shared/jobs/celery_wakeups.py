@@ -149,6 +149,8 @@ class CeleryWakeups:
         self._any_pending.set()
 
     def resend(self, catalog: Catalog) -> int:
+        if self.problem is not None:
+            return 0
         try:
             messages = [(q, text) for q in WakeupQueue for text in self._redis.lrange(q, 0, -1)]
         except BROKER_ERRORS:

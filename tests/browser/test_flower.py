@@ -14,6 +14,7 @@ from typing import Any
 
 import httpx2
 import pytest
+import yaml
 from PIL import Image
 from playwright.sync_api import Browser, expect
 
@@ -24,6 +25,10 @@ from tests.support.photos import photo_bytes
 from tests.support.server import SERVICES_KEY
 from tests.support.servers.daemon import free_ports
 
+ROOT = Path(__file__).parents[2]
+COMPOSED = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]["flower"][
+    "environment"
+]
 PHOTOS = 200
 BROKEN = {20: "broken-20.jpg", 150: "broken-150.jpg"}
 SECONDS = 300.0  # a busy machine makes seconds of work take minutes
@@ -63,10 +68,11 @@ def flower(fleet: Fleet) -> Iterator[httpx2.Client]:
     environment = {
         **os.environ,
         "CELERY_BROKER_URL": fleet.servers.redis.url,
-        "CELERY_CONFIG_MODULE": "shared.telemetry.celery_config",
+        "CELERY_CONFIG_MODULE": COMPOSED["CELERY_CONFIG_MODULE"],
         "FLOWER_ADDRESS": "127.0.0.1",
         "FLOWER_PORT": str(port),
         "FLOWER_READ_ONLY": "true",
+        "FLOWER_TASKS_COLUMNS": COMPOSED["FLOWER_TASKS_COLUMNS"],
         "FLOWER_UNAUTHENTICATED_API": "true",
     }
     command = [str(Path(sys.executable).with_name("celery")), "flower"]
@@ -165,9 +171,12 @@ def test_flower_shows_photos_their_failures_the_queue_and_the_workers(
     assert any(model.startswith("test-slow") for model in stats["models"])
 
     page.goto(f"{url}/tasks?state=FAILURE")
+    table = page.locator("#tasks-table")
     for name in BROKEN.values():
-        expect(page.locator("body")).to_contain_text(name)
-    page.screenshot(path="/tmp/flower-tasks.png", full_page=True)
+        expect(table).to_contain_text(name)
+    expect(table).to_contain_text("undecodable_photo")
+    page.goto(f"{url}/workers")
+    expect(page.locator("#workers-table")).to_contain_text(alive)
     page.goto(f"{url}/worker/{alive}")
     page.get_by_role("tab", name="Other").click()
     expect(page.locator("#tab-other")).to_contain_text("cpu")
