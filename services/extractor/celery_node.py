@@ -34,8 +34,8 @@ log = logging.getLogger(__name__)
 
 HEARTBEAT_SECONDS = 2.0  # as often as Celery's
 POP_SECONDS = 1  # that a look for messages blocks
-# A thread that Redis has not answered for so long, although it answers others, is deaf.
-DEAF_SECONDS = 30.0
+# A thread that Redis has not answered for so long, although it answers others, is stuck.
+STUCK_SECONDS = 30.0
 RECEIVED_QUEUES = (WakeupQueue.QUERY, WakeupQueue.BULK)  # the others are polled
 
 
@@ -82,11 +82,11 @@ class CeleryNode:
         self._arrived.clear()
         return arrived
 
-    def deaf_thread(self) -> str | None:
+    def stuck_thread(self) -> str | None:
         """Return the name of a thread that Redis does not answer, although it answers others."""
         since = self._wakeups.answers_since
         for name, answered_at in self._answered_at.items():
-            if since and time.monotonic() - max(since, answered_at) > DEAF_SECONDS:
+            if since and time.monotonic() - max(since, answered_at) > STUCK_SECONDS:
                 return name
         return None
 

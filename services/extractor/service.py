@@ -7,6 +7,7 @@ make it look sooner, and tell what it does.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import signal
 import socket
@@ -26,18 +27,20 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.installation import open_installation_store
 from shared.catalog.processes import process_heartbeat
 from shared.config.settings import Settings
-from shared.errors import Unavailable
 from shared.jobs.celery_wakeups import CeleryWakeups, create_celery_app
 from shared.storage import ObjectStore
 from shared.telemetry.metrics_server import serve_metrics
+
+log = logging.getLogger(__name__)
 
 
 def serve_extractor(settings: Settings, announce: Announce) -> None:
     """Run the extractor until SIGTERM; claimed jobs are then requeued.
 
+    It exits with code 1 if a thread gets no answer from Redis although Redis answers others.
+
     Raises:
         Misconfigured: `redis_missing`.
-        Unavailable: `redis_deaf` if a thread gets no answer from Redis although others do.
     """
     with service_process(settings, "extractor") as catalog:
         store = open_installation_store(catalog, settings, exclusive=False)
@@ -68,19 +71,17 @@ def _run_extractor(
             announce("Placewise extractor is running")
             worker.run(stop, node.wait)
 
-        threads = start_service_threads(
-            {"jobs": run_jobs, "fits": worker.fits.run, **node.threads()}, stop
-        )
-        deaf = None
-        while deaf is None and not stop.wait(SIGNAL_POLL_SECONDS):
-            deaf = node.deaf_thread()
+        job_threads = start_service_threads({"jobs": run_jobs, "fits": worker.fits.run}, stop)
+        redis_threads = start_service_threads(node.threads(), stop)
+        stuck = None
+        while stuck is None and not stop.wait(SIGNAL_POLL_SECONDS):
+            stuck = node.stuck_thread()
         stop.set()
-        for thread in threads:
+        for thread in job_threads:
+            thread.join()
+        if stuck is not None:
+            log.critical("restarting: the thread %s got no answer from Redis for long", stuck)
+            os._exit(1)  # it may never end
+        for thread in redis_threads:
             thread.join()
         wakeups.send_event("worker-offline")
-    if deaf is not None:
-        raise Unavailable(
-            "redis_deaf",
-            f"The thread {deaf!r} got no answer from Redis, which answers others. The extractor "
-            "ends, so that its supervisor starts it again.",
-        )

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import base64
 import json
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 from uuid import UUID
@@ -15,6 +16,9 @@ from celery import Celery
 from redis import Redis
 from sqlalchemy import func, select, update
 
+from services.extractor import celery_node
+from services.extractor.celery_node import CeleryNode
+from services.service_process import start_service_threads
 from services.steward.tasks.maintenance import resend_wakeups
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
@@ -215,6 +219,39 @@ def done(catalog: Catalog) -> dict[str, int]:
     with catalog.read() as session:
         found = session.execute(select(Job.state, func.count()).group_by(Job.state))
         return {str(state): count for state, count in found}
+
+
+def test_a_thread_that_redis_does_not_answer_is_stuck_unless_redis_answers_nobody(
+    wakeups: CeleryWakeups,
+    app: Celery,
+    own_redis: RedisServer,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(celery_node, "STUCK_SECONDS", 3.0)
+    settings = Settings(redis_url=own_redis.url)
+    node = CeleryNode(app, settings, "extractor-1@here", wakeups, dict)
+    hang, stop = threading.Event(), threading.Event()
+    receive = node._receive_messages
+
+    def receive_until_it_hangs() -> Generator[None]:
+        for _ in receive():
+            yield
+            hang.wait()
+
+    monkeypatch.setattr(node, "_receive_messages", receive_until_it_hangs)
+    threads = start_service_threads(node.threads(), stop)
+    assert own_redis.process is not None
+    own_redis.process.kill()
+    until(lambda: wakeups.problem is not None)
+    time.sleep(4.0)
+    assert node.stuck_thread() is None, "nobody gets an answer"
+    own_redis.process.start()
+    until(lambda: node.stuck_thread() is not None)
+    assert node.stuck_thread() == "messages", "the other thread connects again"
+    stop.set()
+    hang.set()
+    for thread in threads:
+        thread.join()
 
 
 MALFORMED = [
