@@ -169,21 +169,10 @@ class _LoadCollector(Collector):
         yield jobs
         yield oldest
         with contextlib.suppress(SQLAlchemyError):
-            depth = self._admission.queue_depth()
-            yield _gauge(
-                "oldest_waiting_job_seconds",
-                "Age of the oldest job that an extractor could claim; 0 if there is none.",
-                value=depth.oldest_seconds,
-            )
-            yield _gauge(
-                "finished_in_last_minute",
-                "Photos and queries described in the last minute, also failed ones.",
-                value=depth.finished,
-            )
             yield _gauge(
                 "extractors_stalled",
                 "1 if a job waits much longer than usual while none is finished.",
-                value=float(depth.is_stalled),
+                value=float(self._admission.queue_depth().is_stalled),
             )
 
 

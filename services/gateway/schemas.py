@@ -392,15 +392,15 @@ class JobResponse(ResponseModel):
     )
 
     @classmethod
-    def of(cls, job: Job, map_name: str, filename: str | None = None) -> JobResponse:
-        """Build the response; `filename` is that of the job's stored photo, if it has one."""
+    def of(cls, job: Job, map_name: str, filename: str | None) -> JobResponse:
+        """Build the response; `filename` is that of its photo or uploaded file, if it has one."""
         is_query = job.kind == JobKind.DESCRIBE
         return cls.of_row(
             job,
             label=JOB_LABELS[JobKind(job.kind)],
             progress=JobProgress.model_validate(job),
             map=map_name,
-            filename=filename or (job.params or {}).get("filename"),
+            filename=filename,
             result=None if is_query else job.result,
             status_url=job_url(job.id, map_name),
             result_url=job_url(job.id, map_name, "/result") if is_query else None,

@@ -187,12 +187,6 @@ def find_photo_by_sha256(session: Session, map_id: UUID, sha256: str) -> Photo |
     )
 
 
-def read_filenames(session: Session, photo_ids: Iterable[UUID | None]) -> dict[UUID | None, str]:
-    """Return the file names of photos, also of deleted ones, by id."""
-    found = session.execute(sa.select(Photo.id, Photo.filename).where(Photo.id.in_(photo_ids)))
-    return {row.id: row.filename for row in found}
-
-
 def get_live_photos(session: Session, photo_ids: Iterable[UUID]) -> dict[UUID, Photo]:
     """Return the live photos among the ids, by id."""
     photos = session.scalars(

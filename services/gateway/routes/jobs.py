@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from typing import Annotated
 from uuid import UUID
 
@@ -32,7 +32,6 @@ from services.gateway.schemas import JobResponse, JobsResponse
 from shared.catalog.database.errors import to_unavailable
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, UNFINISHED_STATES, get_job, list_jobs
 from shared.catalog.maps import get_map
-from shared.catalog.photos import read_filenames
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.model_changes import cancel_model_change
 from shared.jobs.transitions import cancel_batch, cancel_job, retry_batch, retry_job
@@ -58,9 +57,9 @@ def read_jobs(gateway: GatewayDep, query: Annotated[JobsParams, Query()]) -> Job
         jobs = list_jobs(
             session, map_id, query.state or [], query.kind or [], query.limit + 1, before
         )
-        names = read_filenames(session, {job.photo_id for job in jobs})
+        names = _read_filenames(session, jobs)
     page, next_cursor = query.split(jobs)
-    responses = [JobResponse.of(job, query.map, names.get(job.photo_id)) for job in page]
+    responses = [JobResponse.of(job, query.map, names.get(job.id)) for job in page]
     return JobsResponse(jobs=responses, next_cursor=next_cursor)
 
 
@@ -80,13 +79,15 @@ async def read_job_status(
     return await run_in_threadpool(_job_response, gateway, job, query.map)
 
 
-def _read_filename(session: Session, job: Job) -> str | None:
-    return read_filenames(session, [job.photo_id]).get(job.photo_id)
+def _read_filenames(session: Session, jobs: Sequence[Job]) -> dict[UUID, str | None]:
+    """Return the name of each job's photo or uploaded file."""
+    ids = [job.id for job in jobs]
+    return {message.id: message.file for message in read_job_messages(session, ids)}
 
 
 def _job_response(gateway: GatewayContext, job: Job, map_name: str) -> JobResponse:
     with gateway.catalog.read() as session:
-        return JobResponse.of(job, map_name, _read_filename(session, job))
+        return JobResponse.of(job, map_name, _read_filenames(session, [job]).get(job.id))
 
 
 async def _hold_event_stream(request: Request, admission: AdmissionDep) -> AsyncIterator[None]:
@@ -134,7 +135,7 @@ def cancel_job_by_id(
             cancel_job(job)
         session.flush()
         session.refresh(job)
-        response = JobResponse.of(job, query.map, _read_filename(session, job))
+        response = JobResponse.of(job, query.map, _read_filenames(session, [job]).get(job.id))
         idempotent.store_response(session, 200, response)
         return response
 
@@ -156,7 +157,7 @@ def retry_job_by_id(
             retry_job(session, job)
         session.flush()
         session.refresh(job)
-        response = JobResponse.of(job, query.map, _read_filename(session, job))
+        response = JobResponse.of(job, query.map, _read_filenames(session, [job]).get(job.id))
         idempotent.store_response(session, 200, response)
         messages = read_job_messages(session, [job.id])
     report_jobs(gateway.catalog, gateway.wakeups, [job.id])
