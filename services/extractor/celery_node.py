@@ -178,5 +178,5 @@ class CeleryNode:
 
 def _describe_queue(queue: WakeupQueue) -> dict[str, Any]:
     flags = dict.fromkeys(("exclusive", "auto_delete"), False)
-    unset = dict.fromkeys(("alias", "queue_arguments", "binding_arguments"))
+    unset = dict.fromkeys(("exchange", "alias", "queue_arguments", "binding_arguments"))
     return {"name": queue, "routing_key": queue, "durable": True, "no_ack": True, **flags, **unset}

@@ -190,7 +190,7 @@ def test_photos_are_described_and_queries_answered_while_redis_is_away(
     assert fleet.crashed[crashed:] == []
     assert load.unanswered == []
     assert during.ended > 0.5 * during.queued
-    assert after.ended > 0.8 * after.queued
+    assert after.ended > 0.5 * after.queued
     assert health["parts"]["queue"]["status"] == "degraded", health
     assert health["parts"]["extractors"]["status"] == "healthy", health
     wait_until(lambda: not count_unfinished_jobs(fleet.catalog))
