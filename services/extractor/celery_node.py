@@ -140,6 +140,7 @@ class CeleryNode:
         self._wakeups.send_event(
             event,
             freq=HEARTBEAT_SECONDS,
+            active=len(self._wakeups.active),
             loadavg=load_average(),
             sw_ident="placewise",
             sw_ver=version("placewise"),

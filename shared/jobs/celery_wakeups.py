@@ -117,6 +117,8 @@ class CeleryWakeups:
         self.problem: str | None = None
         self.answers_since: float | None = None
         """Since when Redis takes what is sent (monotonic)."""
+        self.active: set[UUID] = set()
+        """The jobs that this worker has claimed."""
         self._sender = threading.Thread(target=self._run, name="wakeups", daemon=True)
         self._sender.start()
 
@@ -127,6 +129,7 @@ class CeleryWakeups:
 
     def claimed(self, *jobs: JobMessage) -> None:
         self._withdrawn.extend(jobs)
+        self.active.update(job.id for job in jobs)
         for job in jobs:
             self.send_event("task-received", **_describe(job))
 
@@ -136,6 +139,7 @@ class CeleryWakeups:
 
     def report(self, *jobs: Job) -> None:
         for job in jobs:
+            self.active.discard(job.id)
             if job.lease_token is not None:
                 continue  # another worker has taken it over
             worker = {"hostname": job.worker} if job.worker else {}

@@ -112,6 +112,12 @@ class Workplace:
             self.worker.drain(stop)
         return result
 
+    def ended(self) -> tuple[int, int]:
+        """How many jobs have succeeded, and how many have failed."""
+        with self.catalog.read() as session:
+            states = session.scalars(select(Job.state)).all()
+        return states.count(JobState.SUCCEEDED), states.count(JobState.FAILED)
+
     def advance(self) -> None:
         advance_model_changes(self.catalog, self.wakeups, self._queued_chunks)
 

@@ -197,8 +197,8 @@ def test_an_object_store_outage_during_publishing_costs_no_attempt(
         return real(store, key, *more)
 
     monkeypatch.setattr(FolderStore, "writer", away)
-    result = averages.drain()
-    assert (result.claimed, result.succeeded, result.failed) == (8, 4, 0)
+    averages.drain()
+    assert averages.ended() == (4, 0)
     paused = [averages.job_of(photo_id) for photo_id in photo_ids[:BATCH]]
     assert all((job.state, job.attempts) == (JobState.QUEUED, 0) for job in paused)
     assert set(averages.rows()) == set(photo_ids[BATCH:])
@@ -209,8 +209,8 @@ def test_photo_that_the_gpu_can_not_hold_fails_alone_and_is_not_tried_again(
 ) -> None:
     make_too_heavy(monkeypatch, 7)
     photo_ids = averages.upload(1, 7, 2)
-    result = averages.drain()
-    assert (result.claimed, result.succeeded, result.failed) == (3, 2, 1)
+    averages.drain()
+    assert averages.ended() == (2, 1)
     refused = averages.job_of(photo_ids[1])
     assert (refused.state, refused.attempts) == (JobState.FAILED, 0)
     assert problem_of(refused)["code"] == "gpu_out_of_memory"
