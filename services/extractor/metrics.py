@@ -56,7 +56,7 @@ class ExtractorMetrics:
             ["kind", "outcome"],
         )
         self._failures = counter(
-            "failures", "Failed jobs by the code of the error.", ["kind", "code"]
+            "failures", "Failed jobs by the code of the error.", ["kind", "reason"]
         )
         self._stage_seconds = histogram(
             "stage_seconds",
@@ -86,8 +86,8 @@ class ExtractorMetrics:
         """Record the outcomes of a batch and the seconds of its steps."""
         for outcome, jobs in (+batch.outcomes).items():
             self._jobs.labels(batch.kind, outcome).inc(jobs)
-        for code, jobs in (+batch.reasons).items():
-            self._failures.labels(batch.kind, code).inc(jobs)
+        for reason, jobs in (+batch.reasons).items():
+            self._failures.labels(batch.kind, reason).inc(jobs)
         for step, seconds in batch.seconds.items():
             self._stage_seconds.labels(step).observe(seconds)
 

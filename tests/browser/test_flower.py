@@ -179,6 +179,7 @@ def test_flower_shows_photos_their_failures_the_queue_and_the_workers(
     expect(page.locator("#workers-table")).to_contain_text(alive)
     page.goto(f"{url}/worker/{alive}")
     page.get_by_role("tab", name="Other").click()
+    expect(page.locator("#tab-other")).to_be_visible()
     expect(page.locator("#tab-other")).to_contain_text("cpu")
     expect(page.locator("#tab-other")).to_contain_text("test-slow")
     page.close()
