@@ -80,8 +80,6 @@ class ClaimedJobs:
 
     jobs: list[Job]
     lease: contextlib.ExitStack
-    failed: int = 0
-    """Number of jobs that a step has failed because of a PlacewiseError."""
     reasons: Counter[str] = field(default_factory=Counter)
     """Number of jobs that failed, by the code of the error."""
 
@@ -269,8 +267,8 @@ class JobRunner:
                 updated = self._update(
                     claimed, lambda session, job: _fail_or_requeue(session, job, refusal)
                 )
-                claimed.failed = sum(job.state == JobState.FAILED for job in updated)
-                claimed.reasons[error.code] += claimed.failed
+                failed = sum(job.state == JobState.FAILED for job in updated)
+                claimed.reasons[error.code] += failed
             except Exception as error:
                 outcome, event = StepOutcome.CRASHED, f"crashed ({type(error).__name__})"
                 log.exception("%s: crashed", jobs)
