@@ -400,7 +400,9 @@ class Job(Answer):
     awaited: list[str] | None
     progress: Progress
     attempts: int
+    map: str = ""
     file_id: UUID | None
+    filename: str | None = None
     result: dict[str, Any] | None
     error: dict[str, Any] | None
     created_at: datetime

@@ -49,6 +49,7 @@ PANELS = {
     "Operation": {
         "config": "services.cli.environment:config",
         "doctor": "services.cli.operations.doctor:doctor",
+        "jobs": "services.cli.jobs:jobs",
         "keys": "services.cli.operations.keys:app",
         "storage": "services.cli.operations.storage:app",
     },

@@ -82,6 +82,7 @@ def publish(
         )
 
     batch.outcomes.update(context.catalog.run(commit))
+    batch.reasons.update(error.code for _, error in failed)
     log.info(
         "published: %d succeeded, %d failed",
         batch.outcomes["succeeded"],

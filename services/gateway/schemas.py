@@ -369,7 +369,11 @@ class JobResponse(ResponseModel):
     )
     progress: JobProgress
     attempts: int
+    map: str
     file_id: UUID | None = Field(validation_alias="photo_id")
+    filename: str | None = Field(
+        description="name of the photo, or of the uploaded vocabulary or checkpoint"
+    )
     result: dict[str, Any] | None
     error: dict[str, Any] | None = Field(description="an RFC 9457 problem")
     created_at: datetime
@@ -382,12 +386,15 @@ class JobResponse(ResponseModel):
     )
 
     @classmethod
-    def of(cls, job: Job, map_name: str) -> JobResponse:
+    def of(cls, job: Job, map_name: str, filename: str | None) -> JobResponse:
+        """Build the response; `filename` is that of its photo or uploaded file, if it has one."""
         is_query = job.kind == JobKind.DESCRIBE
         return cls.of_row(
             job,
             label=JOB_LABELS[JobKind(job.kind)],
             progress=JobProgress.model_validate(job),
+            map=map_name,
+            filename=filename,
             result=None if is_query else job.result,
             status_url=job_url(job.id, map_name),
             result_url=job_url(job.id, map_name, "/result") if is_query else None,

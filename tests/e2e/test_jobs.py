@@ -15,7 +15,7 @@ import pytest
 
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
-from tests.support.server import ServerProcess
+from tests.support.server import ServerProcess, environment, run_command
 
 # One photo per batch, so that of several photos only the first ones are under way.
 SETTINGS = {"batch_photos": 1}
@@ -56,6 +56,33 @@ def test_a_job_has_its_times_progress_and_result(server: ServerProcess) -> None:
     assert job["error"] is None
     assert job["waiting_for"] is None
     assert job["created_at"] <= job["started_at"] <= job["finished_at"]
+
+
+def test_the_command_names_failed_photos_with_the_reason_and_retries_them(
+    server: ServerProcess,
+) -> None:
+    def jobs(*options: str) -> list[dict[str, Any]]:
+        ran = run_command(
+            "jobs", *options, "--json", env=environment(server.home), cwd=server.home.parent
+        )
+        assert ran.returncode == 0, ran.stderr
+        found: list[dict[str, Any]] = json.loads(ran.stdout)
+        return found
+
+    broken = server.upload(photo_bytes(next(fresh))[:-60], "cut-off.jpg").json()["job_id"]
+    assert server.finished(broken)["state"] == "failed"
+    failed = jobs("--failed")
+    assert {job["state"] for job in failed} == {"failed"}
+    assert (failed[0]["filename"], failed[0]["map"]) == ("cut-off.jpg", "default")
+    assert failed[0]["error"]["code"] == "undecodable_photo"
+    table = run_command("jobs", env=environment(server.home), cwd=server.home.parent).stdout
+    (row,) = [line for line in table.splitlines() if "cut-off.jpg" in line]
+    assert row.startswith("failed\tcut-off.jpg\tindex\t")
+    assert failed[0]["error"]["detail"] in row
+
+    (retried,) = jobs("--retry", "--limit", "1")
+    assert (retried["job_id"], retried["state"]) == (broken, "queued")
+    assert server.finished(broken)["state"] == "failed", "it is as broken as before"
 
 
 def test_jobs_are_listed_newest_first_by_state_and_kind_page_by_page(

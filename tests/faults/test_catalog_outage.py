@@ -91,7 +91,7 @@ class Deployment:
             {
                 "search": self.search.run,
                 "presence": WorkerHeartbeat(self.catalog, self.search, "search").run,
-                "extractor": partial(self._extractor.run, wakeups=wakeups),
+                "extractor": partial(self._extractor.run, wait=wakeups.wait),
                 "steward": Scheduler(self.catalog, store, wakeups, settings).run,
                 "evaluator": evaluator.run,
             },

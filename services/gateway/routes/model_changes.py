@@ -38,6 +38,7 @@ from shared.extractor_config.configs import (
 from shared.http.request_model import RequestModel
 from shared.jobs import Job, JobKind
 from shared.jobs.model_changes import start_model_change
+from shared.jobs.wakeups import JobMessage
 from shared.storage.keys import new_vocabulary_key
 from shared.storage.vocabulary_npz import encode_vocabulary_file
 
@@ -107,7 +108,7 @@ def start_vocabulary_fit(
             raise Conflict("no_photos", "The map has no photos to fit on. Upload photos first.")
         job = start_model_change(session, map_id, JobKind.FIT, params)
         accepted = idempotent.accept_job(session, job)
-    gateway.wakeups.send()
+    gateway.wakeups.send(JobMessage.of(job, query.map))
     return accepted
 
 
@@ -149,7 +150,7 @@ def _queue_import(
         map_id = get_map(session, map_name).id
         job = start_model_change(session, map_id, JobKind.IMPORT, params)
         accepted = idempotent.accept_job(session, job)
-    gateway.wakeups.send()
+    gateway.wakeups.send(JobMessage.of(job, map_name))
     return accepted
 
 
@@ -225,7 +226,7 @@ def start_generation(
         else:
             job = _queue_switch(session, map_id, config, body.vocabulary_id)
         accepted = idempotent.accept_job(session, job)
-    gateway.wakeups.send()
+    gateway.wakeups.send(JobMessage.of(job, query.map))
     return accepted
 
 

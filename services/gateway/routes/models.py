@@ -45,6 +45,7 @@ from shared.extractor_config.names import (
 )
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
+from shared.jobs.wakeups import JobMessage
 from shared.storage.keys import new_checkpoint_key
 
 # The largest backbone (ViT-g) has 4.5 GB of weights. Only admins add models.
@@ -180,7 +181,7 @@ def _queue_model(
             },
         )
         accepted = idempotent.accept_job(session, job)
-    gateway.wakeups.send()
+    gateway.wakeups.send(JobMessage.of(job, map_name))
     return accepted
 
 

@@ -62,6 +62,7 @@ from shared.ingest.photo_metadata import (
 )
 from shared.jobs import Job, JobKind, JobState, Priority
 from shared.jobs.transitions import cancel_jobs, requeue_job_as_new
+from shared.jobs.wakeups import JobMessage
 from shared.storage.keys import preview_key, thumbnail_key
 
 router = APIRouter(tags=["photos"], route_class=JsonRoute)
@@ -249,7 +250,7 @@ def read_preview(
         job = gateway.catalog.run(
             lambda session: _queue_preview(session, admission, photo, query.map)
         )
-        gateway.wakeups.send()
+        gateway.wakeups.send(JobMessage.of(job, query.map, photo.filename))
         return JobAcceptedResponse.of(job, query.map).to_http()
     return Response(data, media_type="image/jpeg", headers=headers)
 

@@ -209,7 +209,7 @@ def _complete_upload(
             _replay_if_completed(locked)
             outcome = UploadOutcome.of(stored, stored.job, map_name)
             locked.status, locked.response_body = outcome.status, outcome.body.model_dump_json()
-    finish_upload(gateway, stored)
+    finish_upload(gateway, stored, map_name)
     # The photo is acknowledged already; garbage collection deletes the object if this fails.
     with contextlib.suppress(Unavailable):
         store.delete(source_key)

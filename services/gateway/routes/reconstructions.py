@@ -37,6 +37,7 @@ from shared.geometry.colmap_model import ColmapModel, rename_images
 from shared.http.request_model import RequestModel
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
+from shared.jobs.wakeups import JobMessage
 from shared.storage.keys import new_checkpoint_key
 
 router = APIRouter(tags=["reconstructions"], route_class=JsonRoute)
@@ -194,7 +195,7 @@ def _queue(
             params=params,
         )
         accepted = idempotent.accept_job(session, job)
-    gateway.wakeups.send()
+    gateway.wakeups.send(JobMessage.of(job, map_name))
     return accepted
 
 

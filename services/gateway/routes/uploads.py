@@ -38,6 +38,7 @@ from shared.imaging.file_formats import ACCEPTED_PHOTOS, photo_suffix
 from shared.ingest.store_photo import StoreResult, insert_photo
 from shared.ingest.validation import check_photo_signature, validate_photo
 from shared.jobs import Job, JobState
+from shared.jobs.wakeups import JobMessage
 from shared.storage.keys import new_original_key
 
 router = APIRouter(tags=["photos"])
@@ -196,14 +197,14 @@ def _store_upload(
             stored = insert_photo(session, map_name, photo)
             outcome = UploadOutcome.of(stored, stored.job, map_name)
             idempotent.store_response(session, outcome.status, outcome.body, outcome.headers)
-    finish_upload(gateway, stored)
+    finish_upload(gateway, stored, map_name)
     return stored
 
 
-def finish_upload(gateway: GatewayContext, stored: StoreResult) -> None:
-    """After the commit: wake the extractors, and delete the object that is not used."""
-    if stored.queued:
-        gateway.wakeups.send()
+def finish_upload(gateway: GatewayContext, stored: StoreResult, map_name: str) -> None:
+    """After the commit: send the job's message, and delete the object that is not used."""
+    if stored.queued and stored.job is not None:
+        gateway.wakeups.send(JobMessage.of(stored.job, map_name, stored.photo.filename))
     if stored.unused_key is not None:
         gateway.store.delete(stored.unused_key)
 

@@ -100,7 +100,7 @@ def test_a_fit_can_be_cancelled_while_photos_are_described(
             fitted.cancel(job_id)
         assert fitted.job(job_id).state == JobState.CANCELLED
         assert fitted.generation(new).state == GenerationState.ABANDONED
-        assert fitted.drain().claimed == 0
+        assert not fitted.drain()
         fitted.advance()
         assert (fitted.active().id, fitted.searchable()) == (old, PHOTOS)
         assert not [j for j in fitted.reindex_jobs(new) if j.state == JobState.QUEUED]

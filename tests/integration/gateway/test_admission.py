@@ -209,7 +209,7 @@ def test_throughput_is_that_of_uploads_and_queries_finished_in_the_last_minute(
 def test_retry_after_follows_from_queue_length_and_throughput(
     waiting: int, per_second: float, seconds: int
 ) -> None:
-    depth = QueueDepth({}, 0, finished_per_second=per_second)
+    depth = QueueDepth({}, 0, finished=round(60 * per_second))
     with pytest.raises(TooManyRequests) as caught:
         admission._check_queue("jobs", waiting, 1000, depth)
     assert caught.value.extra["retry_after_seconds"] == seconds

@@ -88,7 +88,7 @@ def test_a_killed_evaluation_begins_anew(town: Town) -> None:
     assert not town.work(), "its lease is not over"
     expire_lease(town.catalog, job_id)
     with town.catalog.write() as session:
-        assert reclaim_expired_leases(session) == 1
+        assert len(reclaim_expired_leases(session)) == 1
     search = Watched(town.search, 0, kill)
     assert town.work(search)
     assert search.searches >= len(STREETS)
