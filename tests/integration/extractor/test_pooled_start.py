@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from uuid import UUID
@@ -129,7 +130,7 @@ def test_photos_that_waited_for_a_vocabulary_are_described_once_a_worker_starts(
     set_columns(vlads.catalog, vlads.job_of(photo_id).id, waiting_for=WaitingFor.VOCABULARY)
     vlads.drain()
     assert vlads.job_of(photo_id).state == JobState.QUEUED
-    make_worker().warm_up()
+    make_worker().warm_up(threading.Event())
     vlads.drain()
     assert vlads.searchable() == 1
 
