@@ -101,7 +101,6 @@ class SimilarPhoto(Photo):
     """A search result; scores are cosine similarities in [-1, 1]."""
 
     similarity_score: float
-    weighted_score: float | None = None
     match_probability: float | None = None
     inliers: int | None = None
     """Number of points that match the query's; None if the photo was not matched."""
@@ -212,7 +211,6 @@ class Similar(Answer):
     no_pose: str | None = None
     """Why the query has no pose; None with one, and without `pose=True`."""
     vocabulary: str
-    word_weights: str
     generation_id: UUID
     rows: str = "float32"
     certificate: str
@@ -474,21 +472,6 @@ class Generation(Answer):
     created_at: datetime
     activated_at: datetime | None
     ended_at: datetime | None
-
-
-class WordWeights(Answer):
-    """The word weights that were fitted for a generation, one per word of its vocabulary."""
-
-    generation_id: UUID
-    outcome: str
-    reason: str
-    taught_by: str
-    near_pairs: int
-    far_pairs: int
-    seed: int
-    searchable: int
-    held_out: dict[str, Any] | None
-    weights: list[float]
 
 
 class Evaluation(Answer):

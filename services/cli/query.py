@@ -61,13 +61,6 @@ def query(
         str | None,
         typer.Option(help="Only photos whose tags contain all of these comma-separated parts."),
     ] = None,
-    word_weights: Annotated[
-        bool,
-        typer.Option(
-            "--word-weights/--no-word-weights",
-            help="Rank by the map's word weights, if it has any.",
-        ),
-    ] = True,
     matches: Annotated[
         int | None,
         typer.Option(
@@ -140,7 +133,6 @@ def query(
             place=place,
             tags=tags,
             tags_like=tags_like,
-            word_weights=None if word_weights else False,
             certainty=certainty,
         )
         target = describe_target(client, server, map_name)
@@ -149,13 +141,11 @@ def query(
     if as_json:
         print_json(answer)
         return
-    weighted = answer.word_weights == "applied"
     levels = answer.estimate.levels
     table = Table(
         "rank",
         Column("score", no_wrap=True),
         *([Column("match", justify="right", no_wrap=True)] if levels else []),
-        *([Column("weighted", no_wrap=True)] if weighted else []),
         *([Column("points", justify="right", no_wrap=True)] if answer.matches else []),
         Column("photo", overflow="fold"),
         Column("latitude", no_wrap=True),
@@ -167,7 +157,6 @@ def query(
             str(rank),
             f"{match.similarity_score:.4f}",
             *([format_percent(match.match_probability)] if levels else []),
-            *([_format_score(match.weighted_score)] if weighted else []),
             *([_format_count(match.inliers)] if answer.matches else []),
             escape(match.relative_path or match.original_filename),
             _format_degrees(match.latitude),
@@ -188,7 +177,7 @@ def query(
         print_table(_pose_table(answer.pose))
     print_message(
         f"{answer.rows_scanned} photos compared (certificate: {answer.certificate}), "
-        f"vocabulary: {answer.vocabulary}, word weights: {answer.word_weights}\n"
+        f"vocabulary: {answer.vocabulary}\n"
         f"Searched {target}"
     )
 
@@ -256,10 +245,6 @@ def _pose_table(pose: CameraPose) -> Table:
         "focal length", f"{camera.focal_pixels:.0f} of {camera.width} px, {camera.source}"
     )
     return table
-
-
-def _format_score(value: float | None) -> str:
-    return "" if value is None else f"{value:.4f}"
 
 
 def _format_count(value: int | None) -> str:

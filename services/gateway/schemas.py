@@ -101,11 +101,6 @@ class PhotoDetailResponse(PhotoResponse):
 
 class SimilarPhotoResponse(PhotoResponse):
     similarity_score: float = Field(description="cosine similarity in [-1, 1]")
-    weighted_score: float | None = Field(
-        None,
-        description="cosine similarity with word weights, if the result is ranked by it; null if "
-        "it is ranked by `similarity_score`",
-    )
     match_probability: float | None = Field(
         None,
         description="probability that the photo shows the query's place, at the finest of the "
@@ -282,10 +277,6 @@ class SimilarityResponse(ResponseModel):
         "them; `foreign`: fitted on other photos; `pending`: descriptors are GeM-pooled until the "
         "map has a vocabulary; `none`: the extractor uses none"
     )
-    word_weights: str = Field(
-        description="`applied`: ranked by `weighted_score`; `none`: the generation has no weights, "
-        "or the query has no words with weights; `off`: disabled by the request"
-    )
     generation_id: UUID
     rows: RowType = Field(
         description="type of the stored descriptors, for which scores are exact: `float32` or "
@@ -352,7 +343,6 @@ JOB_LABELS = {
     JobKind.ADD_MODEL: "New model",
     JobKind.RECONSTRUCT: "Reconstruction",
     JobKind.EVALUATE: "Evaluation",
-    JobKind.WORD_WEIGHTS: "Word weights",
     JobKind.BATCH: "Batch",
 }
 

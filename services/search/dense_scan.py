@@ -47,14 +47,6 @@ def scan_top_k(
     return _select(chunks, query, rows, scores, kth, margin)
 
 
-def scan_min_score(
-    chunks: Sequence[LoadedChunk], query: QueryRow, min_score: float, row_mask: NDArray[np.bool_]
-) -> tuple[RowNumbers, Scores]:
-    """Find all rows whose cosine may be at least `min_score`; see `scan_top_k`."""
-    rows, scores, margin = _score_rows(chunks, query, row_mask)
-    return _select(chunks, query, rows, scores, min_score, margin)
-
-
 def _select(
     chunks: Sequence[LoadedChunk],
     query: QueryRow,

@@ -142,7 +142,7 @@ UNKNOWN_LOCATION = PhotoLocation(None, None, None)
 
 LocatedRanking = list[tuple[SearchHit, PhotoLocation]]
 RankPhoto = Callable[[GeotaggedPhoto, int], LocatedRanking | None]
-"""`EvaluationSearch.rank_similar` with its weights bound."""
+"""The type of `EvaluationSearch.rank_similar`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,12 +193,11 @@ class EvaluationSearch:
         self,
         query: GeotaggedPhoto,
         k: int,
-        weights: tuple[float, ...] = (),
         excluded_photos: tuple[UUID, ...] = (),
     ) -> LocatedRanking | None:
         """Return the k most similar geotagged database photos with their locations.
 
-        The query photo is excluded, too. Without word weights, the ranking is unweighted.
+        The query photo is excluded, too.
 
         Returns:
             The ranking, best first; None if the query was deleted since.
@@ -221,7 +220,6 @@ class EvaluationSearch:
                 k=k,
                 photos=PhotoFilter(has_place=True),
                 exclude=(query.photo_id, *excluded_photos),
-                word_weights=weights,
             )
             try:
                 answer = self.search.search(request)

@@ -5,9 +5,6 @@ and after it are easy matches, so the recall is optimistic; it is measured a sec
 photos of its sequence. Use both to compare two generations of a map. *Labelled queries* (photos of
 role `query`) were taken at another time: their recall is what users see.
 
-Word weights change the ranking: a place model is valid only for rankings by the weights that it
-was fitted with.
-
 Where the photos have local features, a second place model is fitted on some of the photos with
 their matches. It is used if it answers more at the same share of right answers (`_helps`).
 """
@@ -28,7 +25,6 @@ from services.steward.evaluation_search import (
     EvaluationSearch,
     GeotaggedPhoto,
     GeotaggedPhotos,
-    RankPhoto,
     read_geotagged_photos,
 )
 from shared.catalog.chunks import find_features_model
@@ -241,25 +237,22 @@ class MapEvaluation:
         """Draw at most `size` database photos as leave-one-out queries, reproducible by `seed`."""
         return _draw(self.database.photos, size, seed)
 
-    def evaluate(
-        self, sample: Sequence[GeotaggedPhoto], weights: tuple[float, ...] = ()
-    ) -> MapEvaluationResult:
+    def evaluate(self, sample: Sequence[GeotaggedPhoto]) -> MapEvaluationResult:
         """Search with every photo of the sample and every labelled query, and compute the metrics.
 
-        The sample is that of the leave-one-out evaluation. Without weights, it is unweighted.
+        The sample is that of the leave-one-out evaluation.
         """
-        rank_photo = partial(self.search.rank_similar, weights=weights)
         own_photos = OwnPhotoSampler(
             [photo.spot for photo in self.database.photos],
             [photo.captured_at for photo in self.database.photos],
             self.scheme,
             self.radius_m,
-            partial(self._rank_own_photo, rank_photo),
+            self._rank_own_photo,
         )
         recalls = self._leave_one_out(sample, own_photos, lambda _, ranked: ranked)
         indices = [self._index_of[photo.photo_id] for photo in sample]
         spread = own_photos.spread(indices)
-        labelled = self._evaluate_labelled_queries(rank_photo, own_photos, spread)
+        labelled = self._evaluate_labelled_queries(own_photos, spread)
         samples = list(own_photos.samples(indices, spread))
         to_fit = [o for o in labelled.outcomes if not o.same_session]
         places = evaluate_places(
@@ -371,21 +364,21 @@ class MapEvaluation:
             "leave_one_out_without_sequence": apart.figures(),
         }
 
-    def _rank_own_photo(self, rank_photo: RankPhoto, index: int) -> IndexRanking | None:
+    def _rank_own_photo(self, index: int) -> IndexRanking | None:
         """Rank the photos with a location by their similarity to one of them."""
-        ranking = rank_photo(self.database.photos[index], MAX_RANKS)
+        ranking = self.search.rank_similar(self.database.photos[index], MAX_RANKS)
         self.on_query()
         if ranking is None:
             return None
         indices = np.array([self._index_of[hit.photo_id] for hit, _ in ranking], dtype=np.int64)
-        return indices, np.array([hit.ranked_by for hit, _ in ranking], dtype=np.float64)
+        return indices, np.array([hit.score for hit, _ in ranking], dtype=np.float64)
 
     def _evaluate_labelled_queries(
-        self, rank_photo: RankPhoto, own_photos: OwnPhotoSampler, spread: float
+        self, own_photos: OwnPhotoSampler, spread: float
     ) -> _LabelledQueryMetrics:
         labelled = _LabelledQueryMetrics()
         for number, query in enumerate(self.queries):
-            ranking = rank_photo(query, EVIDENCE_DEPTH)
+            ranking = self.search.rank_similar(query, EVIDENCE_DEPTH)
             self.on_query()
             if ranking is None:
                 continue
@@ -395,7 +388,7 @@ class MapEvaluation:
                     [is_same_place(query.spot, spot, self.radius_m) for _, spot in ranking]
                 )
             ranked = [
-                RankedPhoto(hit.ranked_by, spot, self._index_of.get(hit.photo_id))
+                RankedPhoto(hit.score, spot, self._index_of.get(hit.photo_id))
                 for hit, spot in ranking
             ]
             best = self._index_of.get(ranking[0][0].photo_id) if ranking else None

@@ -76,7 +76,6 @@ SIMILAR: dict[str, Any] = {
     "similar_images": [],
     "estimate": {"reason": "No match."},
     "vocabulary": "own",
-    "word_weights": "none",
     "generation_id": GENERATION_ID,
     "certificate": "exhaustive",
     "rows_scanned": 0,

@@ -21,8 +21,7 @@ NOT_MEASURED = (
 def locate_hits(hits: Sequence[SearchHit], photos: Mapping[UUID, Photo]) -> list[RankedPhoto]:
     """Join hits with the locations of their photos."""
     return [
-        RankedPhoto(hit.ranked_by, _photo_location(photos[hit.photo_id]), hit.photo_id)
-        for hit in hits
+        RankedPhoto(hit.score, _photo_location(photos[hit.photo_id]), hit.photo_id) for hit in hits
     ]
 
 

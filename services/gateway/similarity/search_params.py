@@ -144,9 +144,6 @@ class RankingParams(BaseModel):
     min_score: float | None = Field(
         None, ge=-1, le=1, description="Minimum cosine similarity of the returned photos."
     )
-    word_weights: bool = Field(
-        True, description="Rank by the word weights of the map, if it has any."
-    )
     matches: int | None = Field(
         None,
         ge=0,

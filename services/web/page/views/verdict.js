@@ -27,7 +27,7 @@ export function verdict(found, measurement) {
       h("dl", { class: "facts" },
         bars && kind !== "unknown" && [h("dt", {}, "Not in this map"), h("dd", {}, percent(estimate.not_in_map_probability))],
         h("dt", {}, "Compared"), h("dd", {}, `${count(found.rows_scanned)} rows, ${found.certificate}`),
-        h("dt", {}, "Ranked by"), h("dd", {}, found.word_weights === "applied" ? "similarity, with word weights" : "similarity"),
+        h("dt", {}, "Ranked by"), h("dd", {}, "similarity"),
         h("dt", {}, "Took"), h("dd", {}, `${found.processing_time_ms.toFixed(0)} ms`),
         (found.no_pose ?? found.pose?.reason) && [h("dt", {}, "Pose"), h("dd", {}, found.no_pose ?? found.pose.reason)],
         h("dt", {}, "Vocabulary"), h("dd", {}, found.vocabulary))),
