@@ -170,12 +170,15 @@ class EstimateLevel(Answer):
     latitude: float | None = None
     longitude: float | None = None
     radius_m: float | None = None
+    whole_map: bool = False
     probability: float
 
 
 class Estimate(Answer):
     """Estimated place of a query photo. `in_map` is None if it can't be determined."""
 
+    headline: str
+    """the answer in one sentence"""
     in_map: bool | None = None
     latitude: float | None = None
     longitude: float | None = None
@@ -189,6 +192,7 @@ class Estimate(Answer):
     answer_level: int | None = None
     """index in `levels` of the finest one that is certain enough"""
     certainty: float | None = None
+    elsewhere: float | None = None
     not_in_map_probability: float | None = None
     radius_68_m: float | None = None
     radius_95_m: float | None = None

@@ -137,6 +137,7 @@ def read_geotagged_photos(
 
 
 MAX_READ_ATTEMPTS = 2
+WITH_PLACE = PhotoFilter(has_place=True)
 
 UNKNOWN_LOCATION = PhotoLocation(None, None, None)
 
@@ -193,7 +194,7 @@ class EvaluationSearch:
         self,
         query: GeotaggedPhoto,
         k: int,
-        excluded_photos: tuple[UUID, ...] = (),
+        photos: PhotoFilter = WITH_PLACE,
     ) -> LocatedRanking | None:
         """Return the k most similar geotagged database photos with their locations.
 
@@ -218,8 +219,8 @@ class EvaluationSearch:
                 row=descriptor.row,
                 min_version=self.version,
                 k=k,
-                photos=PhotoFilter(has_place=True),
-                exclude=(query.photo_id, *excluded_photos),
+                photos=photos,
+                exclude=(query.photo_id,),
             )
             try:
                 answer = self.search.search(request)

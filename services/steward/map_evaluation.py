@@ -32,6 +32,7 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map, Matching
 from shared.catalog.photos import PhotoRole
+from shared.catalog.vocabularies import vocabulary_standing
 from shared.evaluation.places.evidence import (
     EVIDENCE_DEPTH,
     MATCHED_PHOTOS,
@@ -42,15 +43,16 @@ from shared.evaluation.places.evidence import (
     is_same_place,
 )
 from shared.evaluation.places.figures import PlaceEvaluation, evaluate_places
-from shared.evaluation.places.fit import MIN_OWN_PHOTOS, PlaceSample
+from shared.evaluation.places.fit import MIN_OWN_PHOTOS, MapScores, PlaceSample
 from shared.evaluation.places.levels import LevelScheme, candidate_levels
-from shared.evaluation.places.probability import PlaceModel
+from shared.evaluation.places.probability import Background, MapExtent, PlaceModel
 from shared.evaluation.places.samples import (
     SAME_SESSION_PERIOD,
     IndexRanking,
     OwnPhotoSampler,
     attach_matches,
 )
+from shared.search_api.photo_filter import PhotoFilter
 from shared.search_api.protocol import SearchBackend, SearchHit
 
 Photo = TypeVar("Photo")
@@ -157,6 +159,8 @@ MAX_MATCHED_SAMPLE = 500  # photos whose matches are computed: about a minute on
 MIN_PHOTOS_TO_DECIDE = 100  # with fewer, it stays open whether matches help
 MIN_ANSWERED_GAIN = 0.03  # of the share of answered queries
 DECISIVE_CERTAINTY = 0.95
+BACKGROUND_PHOTOS = 200  # whose scores with BACKGROUND_QUERIES others are those of random pairs
+BACKGROUND_QUERIES = 30
 MAX_RANKS = 800  # depth of the search for other places where hundreds of photos show the same one
 
 
@@ -228,7 +232,10 @@ class MapEvaluation:
             self.queries = _draw(queries, max_photos or len(queries), seed=0)
             version = session.get_one(Map, generation.map_id).version
             has_features = find_features_model(session, generation.id) is not None
+            has_own_vocabulary = vocabulary_standing(session, generation) == "own"
         self.matching = matching if has_features else Matching.OFF
+        is_known = has_own_vocabulary and "pca" not in generation.spec
+        self._extractor = generation.extractor if is_known else ""
         self._by_id = {photo.photo_id: photo for photo in self.database.photos}
         self._index_of = {photo.photo_id: i for i, photo in enumerate(self.database.photos)}
         self.search = EvaluationSearch(catalog, search, generation, version, self._by_id)
@@ -255,11 +262,17 @@ class MapEvaluation:
         labelled = self._evaluate_labelled_queries(own_photos, spread)
         samples = list(own_photos.samples(indices, spread))
         to_fit = [o for o in labelled.outcomes if not o.same_session]
+        scores = MapScores(
+            spread,
+            self._measure_background(sample),
+            MapExtent.of([photo.spot for photo in self.database.photos], self.scheme),
+            self._extractor,
+        )
         places = evaluate_places(
-            samples, [o.sample for o in to_fit if o.sample], self.scheme, spread
+            samples, [o.sample for o in to_fit if o.sample], self.scheme, scores
         )
         model = places.model
-        with_matches, uses_matches = self._evaluate_matches(own_photos, samples, to_fit, spread)
+        with_matches, uses_matches = self._evaluate_matches(own_photos, samples, to_fit, scores)
         if with_matches is not None:
             of_matches = self._leave_one_out(
                 self._draw_to_match(sample), own_photos, self._order_by_matches
@@ -286,7 +299,7 @@ class MapEvaluation:
         own_photos: OwnPhotoSampler,
         samples: Sequence[PlaceSample],
         labelled: Sequence[QueryOutcome],
-        spread: float,
+        scores: MapScores,
     ) -> tuple[PlaceEvaluation | None, bool | None]:
         """Fit a place model with matches, and one without on the same photos to compare it with.
 
@@ -299,18 +312,30 @@ class MapEvaluation:
         chosen = self._draw_to_match(sorted({sample.photo for sample in samples}))
         matched: list[PlaceSample] = []
         for photo in chosen:
-            matched += own_photos.samples([photo], spread, self._match_own_photo)
+            matched += own_photos.samples([photo], scores.spread, self._match_own_photo)
             self.on_query()
         photos = {sample.photo for sample in matched}
         if len(photos) < MIN_OWN_PHOTOS:
             return None, None
         plain = [sample for sample in samples if sample.photo in photos]
         both = [(o.sample, o.matched_sample) for o in labelled if o.sample and o.matched_sample]
-        without = evaluate_places(plain, [each for each, _ in both], self.scheme, spread)
-        places = evaluate_places(matched, [each for _, each in both], self.scheme, spread)
+        without = evaluate_places(plain, [each for each, _ in both], self.scheme, scores)
+        places = evaluate_places(matched, [each for _, each in both], self.scheme, scores)
         if self.matching == Matching.ON or _helps(without, places):
             return places, True
         return places, False if len(photos) >= MIN_PHOTOS_TO_DECIDE else None
+
+    def _measure_background(self, sample: Sequence[GeotaggedPhoto]) -> Background:
+        """Return mean and deviation of the scores of random pairs of photos."""
+        others = [
+            photo.photo_id for photo in _draw(self.database.photos, BACKGROUND_PHOTOS, seed=1)
+        ]
+        among = PhotoFilter(ids=tuple(others))
+        scores: list[float] = []
+        for photo in _draw(sample, BACKGROUND_QUERIES, seed=2):
+            ranking = self.search.rank_similar(photo, len(others), among) or []
+            scores += [hit.score for hit, _ in ranking]
+        return Background.of(scores)
 
     def _draw_to_match(self, photos: Sequence[Photo]) -> list[Photo]:
         """Draw those of a sample that are matched, always the same."""

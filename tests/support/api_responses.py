@@ -74,7 +74,7 @@ SIMILAR: dict[str, Any] = {
     "processing_time_ms": 1.0,
     "total_similar": 0,
     "similar_images": [],
-    "estimate": {"reason": "No match."},
+    "estimate": {"headline": "No match.", "reason": "No match."},
     "vocabulary": "own",
     "generation_id": GENERATION_ID,
     "certificate": "exhaustive",

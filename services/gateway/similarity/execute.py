@@ -18,12 +18,13 @@ from sqlalchemy.orm import Session
 
 from services.gateway.dependencies import GatewayContext
 from services.gateway.schemas import (
+    CameraPoseResponse,
     EstimateResponse,
     SimilarityResponse,
     SimilarPhotoResponse,
     job_url,
 )
-from services.gateway.similarity.estimate import estimate_place, locate_hits
+from services.gateway.similarity.estimate import estimate_place, locate_hits, place_at_pose
 from services.gateway.similarity.matches import (
     MATCHING_IS_OFF,
     NO_MATCHES,
@@ -185,6 +186,8 @@ def run_similarity_search(
     is_missing = is_labelled and estimate.in_map is False
     pose = find_pose(gateway, query, rankings.found.hits, search_params, is_missing=is_missing)
     similar = rankings.similar
+    if isinstance(pose, CameraPoseResponse):
+        estimate = place_at_pose(estimate, pose)
     hits = matches.rerank(similar.hits, search_params.rerank or 0)[: search_params.top_k]
     response = SimilarityResponse.of_row(
         similar.response,
@@ -356,13 +359,13 @@ def _estimate(
         certainty,
         settings.estimate_radius_m,
         matches.add_to(rankings.located.ranking),
+        search_params.elsewhere,
     )
-    estimate = estimate_place(
-        places,
-        certainty,
-        settings.estimate_radius_m,
-        _no_place_reason(found.hits, search_params.photos),
-    )
+    similar = locate_hits(rankings.similar.hits[: search_params.top_k], rankings.similar.photos)
+    if not any(ranked.location.is_known for ranked in similar):
+        places = None  # the photos that it would be named after do not look like the query
+    reason = _no_place_reason(found.hits, search_params.photos)
+    estimate = estimate_place(places, certainty, search_params.elsewhere, reason)
     if places is None or not model.is_fitted:
         return estimate, {}
     best = (hit.photo_id for hit in rankings.located.hits)
@@ -406,7 +409,7 @@ def _make_history(
 def _no_place_reason(hits: Sequence[SearchHit], photo_filter: PhotoFilter) -> str:
     """Return why there is no estimate, if no photo with a place was found."""
     if hits:
-        return "None of the photos that were found has coordinates or a place label."
+        return "The photos that look like it have no coordinates and no place label."
     if photo_filter.is_empty:
         return "The map has no searchable photos yet."
     return "No photo of the map matches the filter."
