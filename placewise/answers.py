@@ -102,7 +102,6 @@ class SimilarPhoto(Photo):
     """A search result; scores are cosine similarities in [-1, 1]."""
 
     similarity_score: float
-    weighted_score: float | None = None
     match_probability: float | None = None
     inliers: int | None = None
     """Number of points that match the query's; None if the photo was not matched."""
@@ -172,12 +171,15 @@ class EstimateLevel(Answer):
     latitude: float | None = None
     longitude: float | None = None
     radius_m: float | None = None
+    whole_map: bool = False
     probability: float
 
 
 class Estimate(Answer):
     """Estimated place of a query photo. `in_map` is None if it can't be determined."""
 
+    headline: str
+    """the answer in one sentence"""
     in_map: bool | None = None
     latitude: float | None = None
     longitude: float | None = None
@@ -191,6 +193,7 @@ class Estimate(Answer):
     answer_level: int | None = None
     """index in `levels` of the finest one that is certain enough"""
     certainty: float | None = None
+    elsewhere: float | None = None
     not_in_map_probability: float | None = None
     radius_68_m: float | None = None
     radius_95_m: float | None = None
@@ -213,7 +216,6 @@ class Similar(Answer):
     no_pose: str | None = None
     """Why the query has no pose; None with one, and without `pose=True`."""
     vocabulary: str
-    word_weights: str
     generation_id: UUID
     rows: str = "float32"
     certificate: str
@@ -483,21 +485,6 @@ class Generation(Answer):
     created_at: datetime
     activated_at: datetime | None
     ended_at: datetime | None
-
-
-class WordWeights(Answer):
-    """The word weights that were fitted for a generation, one per word of its vocabulary."""
-
-    generation_id: UUID
-    outcome: str
-    reason: str
-    taught_by: str
-    near_pairs: int
-    far_pairs: int
-    seed: int
-    searchable: int
-    held_out: dict[str, Any] | None
-    weights: list[float]
 
 
 class Evaluation(Answer):

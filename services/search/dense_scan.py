@@ -48,14 +48,6 @@ def scan_top_k(
     return _rescore(snapshot, query, rows, scores, kth - float32_error(len(query)))
 
 
-def scan_min_score(
-    snapshot: Snapshot, query: QueryRow, min_score: float, row_mask: NDArray[np.bool_]
-) -> tuple[RowNumbers, Scores]:
-    """Find all rows whose cosine may be at least `min_score`; see `scan_top_k`."""
-    rows, scores = _float32_scores(snapshot, query, row_mask)
-    return _rescore(snapshot, query, rows, scores, min_score)
-
-
 def exact_scores(snapshot: Snapshot, query: QueryRow, rows: RowNumbers) -> Scores:
     """Return the float64 cosines of the given rows; those of equal rows are equal."""
     products: Scores = _multiply(snapshot, rows, query, np.float64)

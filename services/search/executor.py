@@ -6,14 +6,14 @@ and rank by float64 cosines; they differ in the certificate of the result.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search.dense_scan import QueryRow, exact_scores, scan_min_score, scan_top_k
+from services.search.dense_scan import QueryRow, scan_top_k
 from services.search.query_batcher import QueryBatcher
 from services.search.snapshot import Snapshot
 from shared.search_api.protocol import (
@@ -66,7 +66,6 @@ def execute_query(
     row_mask: NDArray[np.bool_],
     options: SearchOptions,
     batcher: QueryBatcher,
-    weighted_query: QueryRow | None = None,
 ) -> SearchResponse:
     """Search the rows of a snapshot that are most similar to a query.
 
@@ -76,35 +75,12 @@ def execute_query(
         row_mask: (n,) bool, the rows that may be returned.
         options: Number of results, minimum score and strategy.
         batcher: Batches the first-level scans of concurrent queries.
-        weighted_query: If given, rows are ranked by their similarity to it. Hits also carry the
-            plain cosine, and `options.min_score` applies to that.
     """
-    plain = _Query(snapshot, query, row_mask, options, batcher)
-    selected = plain.selected
-    if not selected or not query.any():
-        return plain.to_response([], _ScoredRows(NO_ROWS, NO_SCORES, EXHAUSTIVE, 0))
-    if weighted_query is None:
-        scored = plain.score_rows()
-        hits = [
-            SearchHit(photo_id=photo_id, score=score)
-            for photo_id, _, score in plain.rank_photos(scored)
-        ]
-        return plain.to_response(hits, scored)
-    if options.min_score is not None:
-        row_mask = plain.mask_min_score()
-    if not row_mask.any():
-        return plain.to_response([], _ScoredRows(NO_ROWS, NO_SCORES, EXHAUSTIVE, selected))
-    weighted = _Query(snapshot, weighted_query, row_mask, replace(options, min_score=None), batcher)
-    scored = weighted.score_rows()
-    ranked = weighted.rank_photos(scored)
-    plain_scores = _round_scores(
-        exact_scores(snapshot, query, np.array([row for _, row, _ in ranked]))
-    )
-    hits = [
-        SearchHit(photo_id=photo_id, score=score, weighted_score=weighted_score)
-        for (photo_id, _, weighted_score), score in zip(ranked, plain_scores.tolist(), strict=True)
-    ]
-    return plain.to_response(hits, replace(scored, scanned=selected))
+    search = _Query(snapshot, query, row_mask, options, batcher)
+    if not search.selected or not query.any():
+        return search.to_response([], _ScoredRows(NO_ROWS, NO_SCORES, EXHAUSTIVE, 0))
+    scored = search.score_rows()
+    return search.to_response(search.rank_photos(scored), scored)
 
 
 def sign_codes_pay_off(selected: int, k: int) -> bool:
@@ -138,28 +114,8 @@ class _Query:
         rows, scores = scan_top_k(snapshot, self.vector, options.k, self.row_mask)
         return _ScoredRows(rows, scores, EXHAUSTIVE, selected)
 
-    def mask_min_score(self) -> NDArray[np.bool_]:
-        """Return the rows of the mask that score at least `options.min_score`."""
-        min_score, number = self.options.min_score, len(self.row_mask)
-        assert min_score is not None
-        scored = None
-        if (
-            self.options.mode == Mode.AUTO
-            and self.snapshot.has_sign_codes
-            and sign_codes_pay_off(number, 1)
-        ):
-            all_rows = replace(self, options=SearchOptions(number, min_score))
-            scored = all_rows._search_by_sign_codes()
-        if scored is not None:
-            rows, scores = scored.rows, scored.scores
-        else:
-            rows, scores = scan_min_score(self.snapshot, self.vector, min_score, self.row_mask)
-        passing = np.zeros(number, bool)
-        passing[rows[_round_scores(scores) >= min_score]] = True
-        return passing
-
-    def rank_photos(self, scored: _ScoredRows) -> list[tuple[UUID, int, float]]:
-        """Return (photo, row, score), sorted by descending score, ties by photo id."""
+    def rank_photos(self, scored: _ScoredRows) -> list[SearchHit]:
+        """Return the hits, sorted by descending score, ties by photo id."""
         options, rows, scores = self.options, scored.rows, _round_scores(scored.scores)
         if options.min_score is not None:
             passing = scores >= options.min_score
@@ -168,14 +124,14 @@ class _Query:
             kth = np.partition(scores, len(scores) - options.k)[len(scores) - options.k]
             best = scores >= kth
             rows, scores = rows[best], scores[best]
-        ranked: list[tuple[float, UUID, int]] = sorted(
-            (-score, photo_id, row)
-            for score, photo_id, row in zip(
-                scores.tolist(), self.snapshot.photos.ids(rows), rows.tolist(), strict=True
-            )
+        ranked: list[tuple[float, UUID]] = sorted(
+            (-score, photo_id)
+            for score, photo_id in zip(scores.tolist(), self.snapshot.photos.ids(rows), strict=True)
             if photo_id is not None
         )
-        return [(photo_id, row, -score) for score, photo_id, row in ranked[: options.k]]
+        return [
+            SearchHit(photo_id=photo_id, score=-score) for score, photo_id in ranked[: options.k]
+        ]
 
     def to_response(self, hits: list[SearchHit], scored: _ScoredRows) -> SearchResponse:
         """Build the response; missing chunks may contain better rows."""

@@ -38,7 +38,7 @@ from shared.catalog.database.session import Catalog, ChangePoll
 from shared.catalog.generations import GenerationState
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD, Shard
-from shared.errors import Gone, InvalidRequest, NotFound, Unavailable
+from shared.errors import Gone, NotFound, Unavailable
 from shared.search_api.background import subtract_background
 from shared.search_api.protocol import (
     MatchRequest,
@@ -54,7 +54,6 @@ from shared.storage import ObjectStore
 from shared.storage.chunks import Row, read_row, rows_are_valid
 from shared.storage.keys import QUERIES
 from shared.storage.read_retries import ReadRetries
-from shared.word_weights.weights import apply_word_weights
 
 log = logging.getLogger(__name__)
 
@@ -257,8 +256,7 @@ class SearchWorker:
             query = subtract_background(query, background)
         row_mask = build_row_mask(snapshot.photos, request.photos, request.exclude)
         options = SearchOptions(request.k, request.min_score, request.mode)
-        weighted = _weight_query(query, request.word_weights)
-        return execute_query(snapshot, query, row_mask, options, self.query_batcher, weighted)
+        return execute_query(snapshot, query, row_mask, options, self.query_batcher)
 
     def match(self, request: MatchRequest) -> MatchResponse:
         """Match local features, of photos of any shard; see `MatchRequest`."""
@@ -355,15 +353,3 @@ class SearchWorker:
             return False
         self._files_due[snapshot.generation_id] = now + FILE_CHECK_SECONDS
         return any(chunk.was_changed() for chunk in snapshot.chunks)
-
-
-def _weight_query(row: Row, weights: tuple[float, ...]) -> Row | None:
-    """Return the weighted query; None without weights, or if no word of the query has a weight."""
-    if not weights:
-        return None
-    try:
-        weighted = apply_word_weights(row, weights)
-    except ValueError as error:
-        raise InvalidRequest("word_weights_mismatch", f"{error}.") from None
-    # float32 like all rows, so that every search strategy uses the same query.
-    return None if weighted is None else weighted.astype(np.float32)

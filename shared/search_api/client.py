@@ -72,9 +72,9 @@ def merge_responses(
 
 
 def _top_hits(k: int, responses: Sequence[SearchResponse]) -> list[SearchHit]:
-    """The best `k` hits of responses that are sorted each: by `ranked_by`, ties by photo id."""
+    """The best `k` hits of responses that are sorted each: by `score`, ties by photo id."""
     merged = heapq.merge(
-        *(response.hits for response in responses), key=lambda hit: (-hit.ranked_by, hit.photo_id)
+        *(response.hits for response in responses), key=lambda hit: (-hit.score, hit.photo_id)
     )
     hits: dict[UUID, SearchHit] = {}
     for hit in merged:

@@ -54,10 +54,6 @@ class SearchRequest(_Message):
     deletion the caller has seen is taken into account. `exclude` names photos to leave out of the
     result, usually the query itself.
 
-    `word_weights`, one for each word of the generation's vocabulary, multiply the words of the
-    query, and rows are ranked by the similarity to that weighted query; `min_score` still applies
-    to the plain cosine. The weights are sent by value, so that all shards rank by the same ones.
-
     The mean of the rows of `background` is subtracted from the query first
     (`shared.search_api.background`); scores are the cosines to what is left. Rows that no longer
     exist are left out of the mean.
@@ -75,7 +71,6 @@ class SearchRequest(_Message):
     min_score: float | None = None
     exclude: tuple[UUID, ...] = ()
     mode: Mode = Mode.AUTO
-    word_weights: tuple[float, ...] = ()
     background: tuple[RowReference, ...] = ()
 
 
@@ -85,18 +80,10 @@ class SearchHit(_Message):
     photo_id: UUID
     score: float
     """Cosine similarity in [-1, 1]."""
-    weighted_score: float | None = None
-    """Cosine similarity to the weighted query; None for a plain ranking: without weights, or where
-    no word of the query has a weight."""
-
-    @property
-    def ranked_by(self) -> float:
-        """The score that determines the order."""
-        return self.score if self.weighted_score is None else self.weighted_score
 
 
 class SearchResponse(_Message):
-    """Result of a search: `hits` sorted by `SearchHit.ranked_by` descending, ties by photo id."""
+    """Result of a search: `hits` sorted by `score` descending, ties by photo id."""
 
     hits: tuple[SearchHit, ...]
     certificate: str

@@ -85,7 +85,7 @@ class Deployment:
         self.client = TestClient(
             create_app(gateway), base_url="http://localhost", raise_server_exceptions=False
         )
-        evaluator = EvaluationWorker(self.catalog, store, self.search, settings, "evaluator")
+        evaluator = EvaluationWorker(self.catalog, self.search, settings, "evaluator")
         self._stop = threading.Event()
         self._parts = start_service_threads(
             {

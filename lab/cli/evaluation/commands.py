@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import typer
 
 from services.cli.environment import require_packages
-from services.cli.evaluate import SampleOption, SeedOption, WordWeightsOption, evaluate_map
+from services.cli.evaluate import SampleOption, SeedOption, evaluate_map
 from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption
 from shared.errors import InvalidRequest
 from shared.tracks.motion import parse_motion
@@ -186,7 +186,6 @@ def evaluate(
     ] = False,
     sample: SampleOption = None,
     seed: SeedOption = None,
-    word_weights: WordWeightsOption = False,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
@@ -198,7 +197,7 @@ def evaluate(
     labelled queries. With --data, evaluate a --checkpoint, an --extractor, --rows or a --server on
     a data set. With --predictions, evaluate a file of predictions.
     """
-    map_options: OptionValues = {"--sample": sample, "--seed": seed, "--word-weights": word_weights}
+    map_options: OptionValues = {"--sample": sample, "--seed": seed}
     model_options: OptionValues = {
         "--checkpoint": checkpoint, "--extractor": extractor, "--vocabulary": vocabulary,
         "--fit-vocabulary": fit_vocabulary, "--protocol": protocol, "--rule": rule, "--rows": rows,
@@ -280,7 +279,7 @@ def evaluate(
         evaluate_sets(data, sets, protocol, rule, ground_truth, target, report_options)
         return
     _reject_options("without --data", model_options | file_options | output_options)
-    evaluate_map(sample, seed, word_weights, map_name, server, key, as_json)
+    evaluate_map(sample, seed, map_name, server, key, as_json)
 
 
 def _reject_options(context: str, options: OptionValues) -> None:

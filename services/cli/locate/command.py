@@ -263,7 +263,7 @@ def picture_evidence(answer: Similar, photo_count: int) -> PictureEvidence:
             SimilarPosition(
                 photo.latitude,
                 photo.longitude,
-                photo.similarity_score if photo.weighted_score is None else photo.weighted_score,
+                photo.similarity_score,
                 photo.relative_path or photo.original_filename,
             )
             for photo in answer.similar_images

@@ -144,7 +144,7 @@ def _search_evidence(gateway: GatewayContext, pending: _PendingFrame) -> FrameEv
     return frame_evidence(
         pending.frame.captured_at,
         [str(hit.photo_id) for hit in hits],
-        [hit.ranked_by for hit in hits],
+        [hit.score for hit in hits],
         photo_count,
         missing=missing_log_odds(gateway, query),
         fix=min(filter(None, fixes), key=lambda fix: fix.accuracy_m, default=None),

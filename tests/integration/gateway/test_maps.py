@@ -63,9 +63,7 @@ def live_in(service: Service, name: str) -> None:
     service.ask(near_copy(2), name)
     service.drain()
     service.json("POST", "/evaluations", 202, params=params)
-    evaluator = EvaluationWorker(
-        service.catalog, service.store, service.search, settings, "evaluator"
-    )
+    evaluator = EvaluationWorker(service.catalog, service.search, settings, "evaluator")
     assert evaluator.run_next(threading.Event())
     service.json("POST", "/vocabularies", 202, params=params, json={"clusters": 3, "seed": 5})
     finish_changes(service)

@@ -67,7 +67,6 @@ SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
     (answers.Search, stats_module.SearchHistoryEntry),
     (answers.Map, maps.MapResponse),
     (answers.Stats, stats_module.StatsResponse),
-    (answers.WordWeights, evaluations.WordWeightsResponse),
     (answers.DeletedMap, maps.DeletedMapResponse),
     (answers.AddedModel, models.ModelResponse),
     (answers.RemovedModel, models.RemovedModelResponse),

@@ -180,7 +180,7 @@ async function showAnswer(answer, queryPhoto, signal) {
     h("section", {},
       h("h2", { class: "matches-title" }, photos.length ? "Most similar photos" : "No photo found"),
       h("ol", { class: "matches" }, photos.map((photo, index) => h("li", {}, matchCard(photo, index, () => open(index))))),
-      photos.length > 0 && figures(photos, found.word_weights === "applied")));
+      photos.length > 0 && figures(photos)));
   if (measurement) {
     const askAgain = () => showAnswer(answer, queryPhoto, signal);
     followMeasurement(measurement, map, askAgain, () => mine === questions && answer.isConnected, signal);
@@ -245,15 +245,15 @@ function matchCard(photo, index, onclick) {
 }
 
 /** The numbers behind the ranking. */
-function figures(photos, weighted) {
+function figures(photos) {
   const likely = photos.some(hasProbability);
   const order = likely
-    ? `Photos are in the order of the probability that they show the same place. It is computed from all similarities${weighted ? ", with word weights" : ""}. A match is strong from 80 %, fair from 30 %, and weak below. Photos without coordinates or a label keep their place in the order of similarity.`
+    ? `Photos are in the order of the probability that they show the same place. It is computed from all similarities. A match is strong from 80 %, fair from 30 %, and weak below. Photos without coordinates or a label keep their place in the order of similarity.`
     : "Photos are in the order of their similarity.";
   const matched = photos.some((photo) => photo.inliers !== null);
-  const heads = ["", "Photo", ...(likely ? ["Same place"] : []), ...(weighted ? ["Weighted score"] : []), ...(matched ? ["Matching points"] : []), "Similarity"];
+  const heads = ["", "Photo", ...(likely ? ["Same place"] : []), ...(matched ? ["Matching points"] : []), "Similarity"];
   const numbers = (photo) => [
-    ...(likely ? [percent(photo.match_probability)] : []), ...(weighted ? [score(photo.weighted_score)] : []), ...(matched ? [photo.inliers === null ? "–" : count(photo.inliers)] : []), score(photo.similarity_score),
+    ...(likely ? [percent(photo.match_probability)] : []), ...(matched ? [photo.inliers === null ? "–" : count(photo.inliers)] : []), score(photo.similarity_score),
   ];
   return h("details", { class: "card figures" }, h("summary", {}, "Details"),
     h("p", { class: "soft" }, `${order} Similarity is the cosine of two descriptors.`),

@@ -69,7 +69,7 @@ function drawFigures(card, stats, map, failed, look) {
 }
 
 // Those that a search starts are listed as questions.
-const KINDS = ["index", "batch", "fit", "import_vocabulary", "switch", "pca", "add_model", "reconstruct", "evaluate", "word_weights"];
+const KINDS = ["index", "batch", "fit", "import_vocabulary", "switch", "pca", "add_model", "reconstruct", "evaluate"];
 
 function drawJobs(card, jobs, look) {
   if (!jobs.length) {

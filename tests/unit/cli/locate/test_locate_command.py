@@ -421,7 +421,7 @@ def answer(**changes: Any) -> dict[str, Any]:
         {"latitude": LATITUDE, "longitude": LONGITUDE, "radius_m": radius, "probability": 0.97}
         for radius in (25.0, 100.0)
     ]
-    estimate = {"reason": "", "levels": levels, "not_in_map_probability": 0.01}
+    estimate = {"headline": "", "reason": "", "levels": levels, "not_in_map_probability": 0.01}
     return {**SIMILAR, "similar_images": [similar], "estimate": estimate, **changes}
 
 
@@ -460,7 +460,7 @@ def test_what_a_preview_has_shown_is_written_although_the_map_answers_differentl
     shown = searched_proposals(server, folder)
     (folder / "new.jpg").write_bytes(photo(None))
     sure = [{"latitude": 44.0, "longitude": 7.0, "radius_m": 25.0, "probability": 1.0}]
-    will_find(server, answer(estimate={"reason": "", "levels": sure}))
+    will_find(server, answer(estimate={"headline": "", "reason": "", "levels": sure}))
     written = searched(server, folder, "--write", "csv")
     assert written.exit_code == 0, written.output
     assert "1 proposals are not as they were accepted then" in written.stderr
@@ -487,7 +487,7 @@ def test_no_photo_of_a_preview_is_searched_again_unless_it_has_changed_or_a_day_
     assert written.stdout == shown.stdout
     assert "All proposals are as they were then." in written.stderr
     (folder / "4.jpg").write_bytes(photo(26, camera="another"))
-    will_find(server, answer(estimate={"reason": "", "levels": []}))
+    will_find(server, answer(estimate={"headline": "", "reason": "", "levels": []}))
     written = searched(server, folder, "--write", "csv")
     assert written.stderr.rstrip().endswith(": 4.jpg")
     old = datetime.now(UTC) - preview.KEPT_FOR
@@ -501,7 +501,9 @@ def test_no_photo_of_a_preview_is_searched_again_unless_it_has_changed_or_a_day_
 def test_a_map_with_labels_only_gives_places(folder: Path, server: FakeServer) -> None:
     levels = [{"place": "tower/floor 7", "probability": 0.96}, {"place": "tower", "probability": 1}]
     unlocated = {**PHOTO, "latitude": None, "place": "tower/floor 7", "similarity_score": 0.9}
-    by_label = answer(similar_images=[unlocated], estimate={"reason": "", "levels": levels})
+    by_label = answer(
+        similar_images=[unlocated], estimate={"headline": "", "reason": "", "levels": levels}
+    )
     will_find(server, by_label, by_label)
     found = searched_proposals(server, folder)["4.jpg"]
     assert (found["place"], found["accepted"], found["position"]) == ("tower/floor 7", True, None)
@@ -550,7 +552,7 @@ def test_a_place_that_is_not_probable_enough_is_not_written_with_the_position(
     folder: Path, server: FakeServer
 ) -> None:
     levels = [{"place": "tower/floor 7", "probability": 0.3}]
-    unsure = answer(estimate={"reason": "", "levels": levels})
+    unsure = answer(estimate={"headline": "", "reason": "", "levels": levels})
     will_find(server, unsure, unsure)
     found = searched_proposals(server, folder)["day 1/2.jpg"]
     place = (found["accepted"], found["place"], found["place_probability"])
