@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Column
 
-from placewise.answers import CoordinateProposal, Reconstruction
+from placewise.answers import Component, CoordinateProposal, Reconstruction
 from placewise.client import Client
 from services.cli.client import client_command, connect, wait_for_job
 from services.cli.ingest.geotags import find_photos
@@ -151,19 +151,32 @@ def _print_reconstruction(made: Reconstruction, result: Json) -> None:
             str(each.points),
             f"{each.mean_reprojection_error_pixels:.2f} px",
             "" if share is None else format_percent(share),
-            escape(each.not_aligned or f"{each.alignment_rms_m:.2f} m from the coordinates"),
+            escape(each.not_aligned or _format_alignment(each)),
         )
     print_table(table)
     print_message(
         f"{result['reconstructed']} of {result['photos']} photos are in {len(made.components)} "
         "components."
     )
+    if left_out := result["left_out_names"]:
+        print_note(f"In no component: {_shorten(left_out)}")
     if unmatched := result.get("unmatched_names"):
-        shown = ", ".join(unmatched[:MAX_NAMES_SHOWN]) + " ..." * (len(unmatched) > MAX_NAMES_SHOWN)
         print_note(
             f"{result['unmatched']} names of the model are not those of exactly one photo of the "
-            f"map: {shown}"
+            f"map: {_shorten(unmatched)}"
         )
+
+
+def _shorten(names: list[str]) -> str:
+    return ", ".join(names[:MAX_NAMES_SHOWN]) + " ..." * (len(names) > MAX_NAMES_SHOWN)
+
+
+def _format_alignment(component: Component) -> str:
+    text = (
+        f"{component.alignment_rms_m:.2f} m from the coordinates of {component.agreeing} of "
+        f"{component.located} photos"
+    )
+    return f"{text}; on a line, turned as upright cameras are" if component.is_on_line else text
 
 
 def _apply_proposals(

@@ -35,6 +35,7 @@ log = logging.getLogger(__name__)
 
 CACHED_COMPONENT_BYTES = 128_000_000  # of 5,000 photos of 1,000 keypoints and 200 points each
 MAX_CANDIDATES = 20  # photos of the components that the query is matched with
+SAME_FOCAL, SAME_SHAPE = 1e-3, 0.01  # relative differences of photos of one camera
 
 
 class PoseEstimator:
@@ -123,17 +124,28 @@ def _camera(
 ) -> tuple[Camera | None, CameraSource]:
     """Return the camera of the query, if it is known, and where it comes from.
 
-    That of a photo of the reconstruction was refined together with it.
+    That of a photo of the reconstruction was refined together with it: of the query itself, if it
+    is one, or of a photo of the same shape and with the same focal length in its EXIF.
     """
     width, height = query.width, query.height
+    same = set(request.leave_out)
+    if request.camera_source == CameraSource.EXIF and request.focal_length is not None:
+        same |= {
+            one.photo_id
+            for one in request.candidates
+            if one.focal_length and abs(one.focal_length / request.focal_length - 1) < SAME_FOCAL
+        }
+    if request.camera_source != CameraSource.GIVEN:
+        for component in components:
+            for row, photo_id in enumerate(component.photo_ids):
+                camera = component.cameras[component.camera_numbers[row]]
+                if photo_id in same and abs(camera.width * height / camera.height / width - 1) < (
+                    SAME_SHAPE
+                ):
+                    return camera.resized(width, height), CameraSource.MAP
     if request.focal_length is not None:
         camera = Camera.of_focal_length(width, height, request.focal_length)
         return camera, CameraSource(request.camera_source)
-    for component in components:
-        for row, photo_id in enumerate(component.photo_ids):
-            if photo_id in request.leave_out:
-                camera = component.cameras[component.camera_numbers[row]]
-                return camera.resized(width, height), CameraSource.MAP
     return None, CameraSource.ESTIMATED
 
 

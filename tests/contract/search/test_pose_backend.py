@@ -138,6 +138,20 @@ def test_unknown_focal_length_is_estimated_or_that_of_the_same_photo_in_the_reco
     assert np.linalg.norm(pose.position - scene.component.centres()[2]) < 0.05
 
 
+def test_query_by_a_camera_of_the_reconstruction_has_its_refined_focal_length(
+    backend: SearchBackend, store: FolderStore, scene: ReconstructedScene
+) -> None:
+    wrong = 1.3 * CAMERA.focal_length  # in the EXIF of all photos of this camera
+    request = pose_request(store, scene, focal_length=wrong)
+    same = tuple(one.model_copy(update={"focal_length": wrong}) for one in request.candidates)
+    pose = found(backend.estimate_pose(request.model_copy(update={"candidates": same})))
+    assert pose.camera_source == "map"
+    assert pose.focal_pixels == pytest.approx(CAMERA.focal_pixels, rel=0.02)
+    given = request.model_copy(update={"candidates": same, "camera_source": "given"})
+    response = backend.estimate_pose(given)
+    assert response.pose is None or response.pose.camera_source == "given"
+
+
 def test_component_without_alignment_or_calibration_has_a_pose_without_coordinates(
     backend: SearchBackend, store: FolderStore, scene: ReconstructedScene
 ) -> None:
