@@ -179,7 +179,9 @@ def find_misplaced(
     known = np.flatnonzero(np.isfinite(positions[:, :2]).all(axis=1))
     if len(known) < MIN_BLOCK:
         return nothing
-    fitted = fit_to_positions(centres[known], [rotations[i] for i in known], positions[known])
+    fitted = fit_to_positions(
+        centres[known], [rotations[i] for i in known.tolist()], positions[known]
+    )
     if fitted is None:
         return nothing
     modelled = fitted.apply(centres)[:, :2]
@@ -194,7 +196,7 @@ def find_misplaced(
     limit = math.sqrt(2) * _limit(own)  # of the distance of two photos
     for photo in np.flatnonzero(off & ~off_together).tolist():
         of_photo = (one == photo) | (other == photo)
-        nearer = of_photo & (near + limit < modelled_near)
+        nearer = of_photo & (2 * near < modelled_near) & (modelled_near > _limit(own))
         off_together[photo] = counts[nearer].sum() >= MIN_NEARER_SHARE * counts[of_photo].sum()
     contradicts = (off_together[one] | off_together[other]) & (near > modelled_near + limit)
     return off_together, contradicts

@@ -67,7 +67,7 @@ def adjust_to_positions(pycolmap: Any, model: Any, photos: Sequence[PhotoToMap])
     if len(known) < MIN_BLOCK:
         return
     centres = np.array([image.projection_center() for image in images])[known]
-    found = fit_to_positions(centres, [rotations[row] for row in known], positions[known])
+    found = fit_to_positions(centres, [rotations[row] for row in known.tolist()], positions[known])
     if found is None:
         return
     model.transform(
