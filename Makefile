@@ -18,7 +18,7 @@ INSTALLED := $(VENV)/.installed
 INSTALL := VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-lab test-fast test-numerics test-deploy test-images test-browser test-api-fuzz pictures api-page lint size types bench demo env clean
+.PHONY: help setup run test test-lab test-chaos test-fast test-numerics test-deploy test-images test-browser test-api-fuzz pictures api-page lint size types bench demo env clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
@@ -48,6 +48,9 @@ test: $(INSTALLED) ## all tests (PLACEWISE_TEST_DATA=FOLDER adds those on real p
 
 test-lab: $(INSTALLED) ## tests of the lab (part of `make test`)
 	$(BIN)/python -m pytest tests/lab --numprocesses auto --dist loadfile --no-loadscope-reorder
+
+test-chaos: $(INSTALLED) ## kill, stop and restart services of a whole deployment under load
+	PLACEWISE_TEST_CHAOS=1 $(BIN)/python -m pytest tests/faults/test_chaos.py tests/faults/test_rolling.py --numprocesses 2 --dist loadfile
 
 test-fast: $(INSTALLED) ## unit and contract tests that need no server
 	$(BIN)/python -m pytest tests/unit tests/contract tests/lab/unit tests/lab/contract -m "not servers" --numprocesses logical --dist loadfile

@@ -6,7 +6,7 @@ Fields that a newer server adds are available as attributes, too.
 
 from __future__ import annotations
 
-from datetime import datetime
+from datetime import datetime, timedelta
 from typing import Any
 from uuid import UUID
 
@@ -29,7 +29,7 @@ class Answer(BaseModel):
 
 
 class Photo(Answer):
-    """A stored photo. Coordinates are WGS 84 degrees; `heading` is clockwise from north."""
+    """A stored photo. Coordinates are WGS 84 degrees; `heading` is clockwise from true north."""
 
     image_id: UUID
     image_path: str
@@ -79,6 +79,7 @@ class Uploaded(Answer):
     status: str
     status_url: str
     already_there: bool
+    updated: list[str]
     message: str
 
 
@@ -101,7 +102,6 @@ class SimilarPhoto(Photo):
     """A search result; scores are cosine similarities in [-1, 1]."""
 
     similarity_score: float
-    weighted_score: float | None = None
     match_probability: float | None = None
     inliers: int | None = None
     """Number of points that match the query's; None if the photo was not matched."""
@@ -172,12 +172,15 @@ class EstimateLevel(Answer):
     latitude: float | None = None
     longitude: float | None = None
     radius_m: float | None = None
+    whole_map: bool = False
     probability: float
 
 
 class Estimate(Answer):
     """Estimated place of a query photo. `in_map` is None if it can't be determined."""
 
+    headline: str
+    """the answer in one sentence"""
     in_map: bool | None = None
     latitude: float | None = None
     longitude: float | None = None
@@ -191,6 +194,7 @@ class Estimate(Answer):
     answer_level: int | None = None
     """index in `levels` of the finest one that is certain enough"""
     certainty: float | None = None
+    elsewhere: float | None = None
     not_in_map_probability: float | None = None
     radius_68_m: float | None = None
     radius_95_m: float | None = None
@@ -213,7 +217,6 @@ class Similar(Answer):
     no_pose: str | None = None
     """Why the query has no pose; None with one, and without `pose=True`."""
     vocabulary: str
-    word_weights: str
     generation_id: UUID
     rows: str = "float32"
     certificate: str
@@ -296,8 +299,14 @@ class PhotoHeader(Answer):
     """UTC; if `time_zone_is_known` is False, the camera's clock as if it were UTC"""
     time_zone_is_known: bool
     camera: str | None
+    camera_is_unique: bool
+    """`camera` contains a serial number or an owner"""
+    clock_offset: timedelta | None
+    """of the camera's clock from UTC, by its tag or the GPS time"""
     latitude: float | None
     longitude: float | None
+    gps_error: str | None
+    """why the photo may have coordinates although none are known"""
     focal_length: float | None = None
     """as a multiple of the photo's longer side"""
 
@@ -397,7 +406,9 @@ class Job(Answer):
     awaited: list[str] | None
     progress: Progress
     attempts: int
+    map: str = ""
     file_id: UUID | None
+    filename: str | None = None
     result: dict[str, Any] | None
     error: dict[str, Any] | None
     created_at: datetime
@@ -478,21 +489,6 @@ class Generation(Answer):
     created_at: datetime
     activated_at: datetime | None
     ended_at: datetime | None
-
-
-class WordWeights(Answer):
-    """The word weights that were fitted for a generation, one per word of its vocabulary."""
-
-    generation_id: UUID
-    outcome: str
-    reason: str
-    taught_by: str
-    near_pairs: int
-    far_pairs: int
-    seed: int
-    searchable: int
-    held_out: dict[str, Any] | None
-    weights: list[float]
 
 
 class Evaluation(Answer):

@@ -147,10 +147,9 @@ class AsyncClient(AsyncTransport):
                 polls the job instead.
             filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
                 `captured_before`, `place`, `place_under`, `tags`, `tags_like` and `ids`
-                (comma-separated);
-                `word_weights=False` ranks by the unweighted cosine similarity; `certainty` is the
-                share of answers that must be right; `history=False` leaves the search out of the
-                search history.
+                (comma-separated); `certainty` is the share of answers that must be right;
+                `elsewhere` the share of queries that are from elsewhere than the map;
+                `history=False` leaves the search out of the search history.
         """
         options: Json = {
             "params": drop_none(
@@ -485,16 +484,6 @@ class AsyncClient(AsyncTransport):
             on_received: Called with the number of bytes received so far.
         """
         await self._download(f"/reconstructions/{reconstruction_id}/colmap", file, on_received)
-
-    async def learn_word_weights(self, /, generation_id: Id, **options: int) -> answers.Started:
-        """Start fitting word weights of the active generation; options are `sample` and `seed`."""
-        path = f"/generations/{generation_id}/word-weights"
-        return answers.Started(**await self._call("POST", path, json=options))
-
-    async def word_weights(self, generation_id: Id) -> answers.WordWeights:
-        """Get the word weights that were fitted for a generation."""
-        path = f"/generations/{generation_id}/word-weights"
-        return answers.WordWeights(**await self._call("GET", path))
 
     async def evaluate(self, /, **options: int) -> answers.Started:
         """Start an evaluation of the map; options are `sample` and `seed`."""

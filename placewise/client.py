@@ -180,8 +180,6 @@ class Client:
     reconstruction = _blocking(AsyncClient.reconstruction)
     coordinate_proposals = _blocking(AsyncClient.coordinate_proposals)
     export_colmap = _blocking(AsyncClient.export_colmap)
-    learn_word_weights = _blocking(AsyncClient.learn_word_weights)
-    word_weights = _blocking(AsyncClient.word_weights)
     evaluate = _blocking(AsyncClient.evaluate)
     evaluations = _iterating(AsyncClient.evaluations)
     searches = _iterating(AsyncClient.searches)

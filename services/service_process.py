@@ -22,6 +22,10 @@ log = logging.getLogger(__name__)
 # That a starting service gives the catalog and `placewise storage migrate`.
 SCHEMA_WAIT_SECONDS = 60.0
 
+# Python runs a signal's handler when the main thread is awake. A signal that arrives just as the
+# thread blocks is handled when that ends.
+SIGNAL_POLL_SECONDS = 1.0
+
 RunUntilStopped = Callable[[threading.Event], None]
 """Runs until the event is set."""
 

@@ -151,8 +151,10 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
             with catalog.write() as session:
                 delete_dead_search_workers(session, all_workers=True)
                 delete_processes(session, "extractor")
-            reclaim_leases(catalog, all_leases=True)
+            reclaim_leases(catalog, wakeups, all_leases=True)
 
+        registry = CollectorRegistry()  # shared: /metrics has the metrics of all services
+        stack.enter_context(serve_metrics(settings, registry))
         # After everything that can fail: a key that is created but not shown would be lost.
         host, port = listener.getsockname()[:2]
         requests = catalog.with_timeouts(REQUEST_TIMEOUTS)
@@ -160,13 +162,12 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         url = reachable_url(host, port)
         stack.enter_context(announce_server(home, url, local_key))
 
-        registry = CollectorRegistry()  # shared: /metrics has the metrics of all services
         search = SearchWorker(catalog, store, settings)
         name = f"embedded-{os.getpid()}"
         heartbeat = WorkerHeartbeat(catalog, search, name)
         steward_metrics = StewardMetrics(registry)
         steward = Scheduler(catalog, store, wakeups, settings, steward_metrics)
-        evaluator = EvaluationWorker(catalog, store, search, settings, name, steward_metrics)
+        evaluator = EvaluationWorker(catalog, search, settings, name, steward_metrics)
         webhooks = WebhookDispatcher(catalog, settings)
         batches = BatchWorker(catalog, store, wakeups, settings, name, steward_metrics)
         metered_search = MeteredSearch(search, registry)
@@ -183,7 +184,6 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         server = http_server(
             create_app(gateway), gateway.connections, on_stop=gateway.job_notifier.begin_shutdown
         )
-        stack.enter_context(serve_metrics(settings, registry))
         running = Standalone(url, gateway.lan_url, server, listener, first_admin_key, local_key)
 
         def run_extractor(stop: threading.Event) -> None:
@@ -205,7 +205,8 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
                 process_heartbeat(catalog, "extractor", extractor.state),
             ):
                 threads = start_service_threads({"fits": extractor.fits.run}, stop)
-                extractor.run(stop, wakeups)
+                extractor.warm_up(stop)
+                extractor.run(stop, wakeups.wait)
                 for thread in threads:
                     thread.join()
 

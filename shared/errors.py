@@ -158,6 +158,11 @@ class Misconfigured(PlacewiseError):
     title = "The installation needs attention"
 
 
+def shorten(text: str, characters: int) -> str:
+    """Cut what the caller sent down to what an error repeats of it."""
+    return text if len(text) <= characters else f"{text[:characters]}..."
+
+
 def invalid_field_error(field: str, detail: str) -> Unprocessable:
     """Return the 422 for one field whose value is out of range or can't be parsed."""
     return Unprocessable(

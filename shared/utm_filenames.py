@@ -14,6 +14,8 @@ import utm
 
 from shared.errors import InvalidRequest
 
+BANDS = "CDEFGHJKLMNPQRSTUVWX"  # of 8 degrees, from 80 S; the last has 12
+BAND_TOLERANCE = 0.1  # degrees: photos of a town on the border of two have one letter
 FIELDS = 16  # 14 between the first and the last `@`; splitting gives two more
 FULL_DATES = {8: "%Y%m%d", 14: "%Y%m%d%H%M%S"}  # by length; a year or a month alone is not a date
 
@@ -53,8 +55,31 @@ def upload_fields_of_file_name(name: str, utm_zone: str | None) -> dict[str, str
 
 
 def utm_to_degrees(east: float, north: float, number: int, letter: str) -> tuple[float, float]:
-    latitude, longitude = utm.to_latlon(east, north, number, letter)
-    return float(latitude), float(longitude)
+    """Convert UTM metres to degrees.
+
+    Raises:
+        ValueError: The northing is not in the band of the letter: an S may stand for the south.
+        utm.OutOfRangeError: A number is out of range.
+    """
+    latitude, longitude = map(float, utm.to_latlon(east, north, number, letter))
+    south = -80 + 8 * BANDS.index(letter)
+    north_end = 84 if letter == BANDS[-1] else south + 8
+    if south - BAND_TOLERANCE <= latitude <= north_end + BAND_TOLERANCE:
+        return latitude, longitude
+    readings = []
+    for northern in (True, False):
+        with contextlib.suppress(utm.OutOfRangeError):
+            other = float(utm.to_latlon(east, north, number, northern=northern)[0])
+            band = utm.latitude_to_zone_letter(other)
+            readings.append(f"{number}{band} for {abs(other):.2f} {'N' if northern else 'S'}")
+    raise ValueError(
+        f"northing {north:,.0f} is not in band {letter} ({_format_band(south, north_end)}); pass "
+        f"the letter of its band: {' or '.join(readings)}"
+    )
+
+
+def _format_band(south: int, north: int) -> str:
+    return f"{south} to {north} N" if south >= 0 else f"{-south} to {-north} S"
 
 
 def parse_full_date(timestamp: str) -> datetime | None:

@@ -28,6 +28,7 @@ from tests.support.servers import (
     PostgresServer,
     RedisServer,
     S3Server,
+    start_moto,
     start_postgres,
     start_redis,
     start_s3,
@@ -37,6 +38,7 @@ from tests.support.spare_databases import SpareDatabases
 REAL_PHOTOS = "PLACEWISE_TEST_DATA"
 BROWSER = "PLACEWISE_TEST_BROWSER"
 IMAGES = "PLACEWISE_TEST_IMAGES"
+CHAOS = "PLACEWISE_TEST_CHAOS"
 SERVER_FIXTURES = frozenset({"postgres", "redis", "s3", "moto"})
 SERVER_PARAMETERS = frozenset({"postgresql", "redis", "s3", "moto", "bucket"})
 TESTS = Path(__file__).parent
@@ -48,11 +50,19 @@ COMPUTING = ("integration", "contract", "unit")
 gc.set_threshold(50_000)
 # Imports freeze their objects, of which triton would report hundreds as leaked at the end.
 atexit.register(gc.unfreeze)
-collect_ignore = [
-    folder
-    for variable, folder in ((BROWSER, "browser"), (IMAGES, "deploy/images"))
-    if not os.environ.get(variable)
-]
+# A variable, the paths that are collected where it is set, and what to say where it is not.
+OPTIONAL: tuple[tuple[str, list[str], str], ...] = (
+    (REAL_PHOTOS, [], f"on real photos: {REAL_PHOTOS}=FOLDER runs them (docs/CONTRIBUTING.md)"),
+    (BROWSER, ["browser"], "in a browser: make test-browser runs them"),
+    (IMAGES, ["deploy/images"], "of the images: make test-images runs them"),
+    (
+        CHAOS,
+        ["faults/test_chaos.py", "faults/test_rolling.py"],
+        "of a deployment under faults: make test-chaos runs them",
+    ),
+)
+LEFT_OUT = [option for option in OPTIONAL if not os.environ.get(option[0])]
+collect_ignore = [path for _, paths, _ in LEFT_OUT for path in paths]
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -91,15 +101,19 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run a test of the catalog on both databases, or on those that its nearest marker names."""
+    """Run a test of the catalog on both databases, a test of `integration` on PostgreSQL, or on
+    those that its nearest marker names."""
     if "catalog_kind" in metafunc.fixturenames:
         marker = metafunc.definition.get_closest_marker("databases")
-        metafunc.parametrize("catalog_kind", marker.args if marker else ("sqlite", "postgresql"))
+        integration = _kind(metafunc.definition.path) == "integration"
+        default = ("postgresql",) if integration else ("sqlite", "postgresql")
+        metafunc.parametrize("catalog_kind", marker.args if marker else default)
 
 
 def _places(items: list[pytest.Item], kinds: tuple[str, ...]) -> dict[Path, float]:
     """The relative position of each file among those of these kinds, from 0 to 1."""
-    files = {item.path: kinds.index(_kind(item)) for item in items if _kind(item) in kinds}
+    paths = dict.fromkeys(item.path for item in items)
+    files = {path: kinds.index(_kind(path)) for path in paths if _kind(path) in kinds}
     ordered = sorted(files, key=files.__getitem__)
     return {file: place / len(ordered) for place, file in enumerate(ordered)}
 
@@ -112,25 +126,14 @@ def _needs_server(item: pytest.Item) -> bool:
     return bool(fixtures & SERVER_FIXTURES or parameters & SERVER_PARAMETERS)
 
 
-def _kind(item: pytest.Item) -> str:
-    kind, below, *_ = item.path.relative_to(TESTS).parts
+def _kind(path: Path) -> str:
+    kind, below, *_ = path.relative_to(TESTS).parts
     return below if kind == "lab" else kind
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    if not os.environ.get(REAL_PHOTOS):
-        terminalreporter.write_line(
-            f"The tests on real photos were left out: set {REAL_PHOTOS} to a folder with "
-            "toy-places/ and anyloc-vocabularies/ to run them."
-        )
-    if not os.environ.get(BROWSER):
-        terminalreporter.write_line(
-            "The tests in a browser were left out: make test-browser runs them."
-        )
-    if not os.environ.get(IMAGES):
-        terminalreporter.write_line(
-            "The tests of the images were left out: make test-images runs them."
-        )
+    for _, _, which in LEFT_OUT:
+        terminalreporter.write_line(f"Left out are the tests {which}.")
 
 
 @pytest.fixture(autouse=True)
@@ -169,6 +172,13 @@ def redis() -> Iterator[RedisServer]:
 def s3() -> Iterator[S3Server]:
     """A real S3 server, as above."""
     with start_s3() as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def moto() -> Iterator[S3Server]:
+    """A bucket that takes whatever is sent: what is signed protects nothing there."""
+    with start_moto() as server:
         yield server
 
 

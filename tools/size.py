@@ -1,15 +1,19 @@
 """Prints the size of the code beside its limits, and fails where a limit is exceeded: `make size`.
 
 The limits and aims are in a table of `docs/architecture.md`. `python -m tools.size --lower` lowers
-the limits there to the present figures; raising one is a decision, and is edited by hand.
+the limits there to the present figures. Raising one is a decision, and is edited by hand before the
+lines are written: the commit that raises a limit adds a decision record and changes no Python file,
+and the lines that it finds are within the limits.
 """
 
 from __future__ import annotations
 
 import re
+import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 
 from rich.table import Column
@@ -19,7 +23,8 @@ from services.cli.output import Table, print_note, print_table
 from shared.config.settings import Settings
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "architecture.md"
+PAGE = "docs/architecture.md"
+RECORDS = "docs/decisions/"
 HEADING = "## Size"
 ROOMS = {
     "service": ("placewise", "services", "shared", "tools"),
@@ -28,6 +33,7 @@ ROOMS = {
 }
 MIGRATIONS = "shared/catalog/migrations/versions"
 ROW = re.compile(r"^\| ([a-z ]+) \| ([\d,]+|-) \| ([\d,]+|-) \|$", re.MULTILINE)
+ROW_OF_GIT = "^| [a-z ]* | [0-9,-]* | [0-9,-]* |$"
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +61,7 @@ def read_bounds(page: str) -> dict[str, Bound]:
     """Read the table below `HEADING`, whose rows are `| figure | limit | aim |`."""
     _, heading, section = page.partition(f"\n{HEADING}\n")
     if not heading:
-        raise SystemExit(f"{PAGE.name} has no heading `{HEADING}`.")
+        raise SystemExit(f"{PAGE} has no heading `{HEADING}`.")
     section = section.partition("\n## ")[0]
     return {name: Bound(_number(limit), _number(aim)) for name, limit, aim in ROW.findall(section)}
 
@@ -69,6 +75,70 @@ def find_violations(figures: Mapping[str, int], bounds: Mapping[str, Bound]) -> 
         if limit is not None and figure > limit:
             found.append(f"{name}: {figure:,} is above the limit of {limit:,}")
     return found
+
+
+def find_late_raises(root: Path) -> list[str]:
+    """Describe what is wrong with a raise in the working tree and with the last one in the history.
+
+    Merges are not examined: they bring what their commits raised.
+
+    Raises:
+        OSError: Git is not installed.
+        subprocess.CalledProcessError: the folder has no Git history.
+    """
+    found: list[str] = []
+    if not (root / _git(root, "rev-parse", "--git-path", "MERGE_HEAD").strip()).exists():
+        found = _examine_change(root, "HEAD", "") or []
+    log = _git(root, "log", "--no-merges", f"-G{ROW_OF_GIT}", "--format=%H %P", "--", PAGE)
+    for line in log.splitlines():
+        commit, _, parent = line.partition(" ")
+        examined = _examine_change(root, parent, commit) if parent else []  # a shallow clone's end
+        if examined is not None:
+            return found + examined
+    return found
+
+
+def _examine_change(root: Path, parent: str, commit: str) -> list[str] | None:
+    """Describe what is wrong with the raise of a limit between `parent` and `commit`, which is the
+    working tree where it is empty; None if no limit is raised."""
+    before, after = _limits_at(root, parent), _limits_at(root, commit)
+    raised = [name for name in before.keys() & after.keys() if before[name] < after[name]]
+    if not raised:
+        return None
+    title = f"{commit[:10] or 'the working tree'} raises the limit of {', '.join(sorted(raised))}"
+    changes = _git(root, "diff", "--name-status", "--no-renames", parent, *commit.split())
+    found = []
+    if ".py\n" in changes:
+        found.append(f"{title}, and changes Python files: commit the raise alone, before them")
+    if f"A\t{RECORDS}" not in changes:
+        found.append(f"{title} without adding a decision record in {RECORDS}")
+    for room in raised:
+        lines = _lines_at(root, parent, room.removeprefix("lines of the "))
+        if lines > before[room]:
+            found.append(f"{title}, which {lines:,} lines had exceeded before")
+    return found
+
+
+def _limits_at(root: Path, commit: str) -> dict[str, float]:
+    """The limits at a commit, or in the working tree; infinite where a figure has none."""
+    text = _git(root, "show", f"{commit}:{PAGE}") if commit else (root / PAGE).read_text("utf-8")
+    rows = read_bounds(text) if f"\n{HEADING}\n" in text else {}
+    return {name: inf if bound.limit is None else bound.limit for name, bound in rows.items()}
+
+
+def _lines_at(root: Path, commit: str, room: str) -> int:
+    """The lines of a room's Python files at a commit; 0 for a figure that is not one of lines."""
+    patterns = [f"{folder}/*.py" for folder in ROOMS.get(room, ())]
+    if not patterns:
+        return 0
+    counts = _git(root, "grep", "--count", "", commit, "--", *patterns).splitlines()
+    return sum(int(count.rpartition(":")[2]) for count in counts)
+
+
+def _git(root: Path, *arguments: str) -> str:
+    return subprocess.run(
+        ("git", *arguments), cwd=root, capture_output=True, text=True, check=True
+    ).stdout
 
 
 def lower_limits(page: str, figures: Mapping[str, int]) -> str:
@@ -89,10 +159,10 @@ def lower_limits(page: str, figures: Mapping[str, int]) -> str:
 def main(arguments: list[str]) -> None:
     """Print the table; exit with code 1 if a limit is exceeded."""
     figures = measure(ROOT)
-    page = PAGE.read_text("utf-8")
+    page = (ROOT / PAGE).read_text("utf-8")
     if arguments == ["--lower"]:
         page = lower_limits(page, figures)
-        PAGE.write_text(page, "utf-8")
+        (ROOT / PAGE).write_text(page, "utf-8")
     elif arguments:
         raise SystemExit("usage: python -m tools.size [--lower]")
     bounds = read_bounds(page)
@@ -103,10 +173,15 @@ def main(arguments: list[str]) -> None:
         table.add_row(name, f"{figure:,}", _shown(bound.limit), _shown(bound.aim))
     print_table(table)
     violations = find_violations(figures, bounds)
+    try:
+        violations += find_late_raises(ROOT)
+    except (OSError, subprocess.CalledProcessError) as error:
+        reason = getattr(error, "stderr", None) or error
+        print_note(f"The history was not examined for limits that were raised late: {reason}")
     for violation in violations:
         print_note(violation)
     if violations:
-        print_note(f"Raise a limit in docs/{PAGE.name} only with a decision record.")
+        print_note("docs/CONTRIBUTING.md says how a limit is raised.")
         raise SystemExit(1)
 
 

@@ -12,7 +12,8 @@ database photos only, as that of a live map is, and judged
   has the same neighbours as a photo of the map;
 - on a random half of the set's queries, with the other half as labelled queries, as often;
 - on the set's queries with a quarter of the map's second coarsest labels left out, such as floors,
-  four times: how many of the photos of these labels get an answer.
+  four times: how many of the photos of these labels get an answer;
+- on photos of elsewhere, those of each of the other folders: how many get an answer.
 
 If the labels are paths, the photos of each second coarsest label are then followed as a walk, in
 the order of their names, which end with a number of seconds: its queries through the whole map, and
@@ -24,8 +25,8 @@ Intervals are those of the cluster bootstrap (`shared/evaluation/bootstrap.py`).
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
 from itertools import pairwise
@@ -41,6 +42,7 @@ from lab.benchmarks.report import Report, printed_report
 from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.datasets.ground_truth import find_positives, parse_rule
 from lab.datasets.open_dataset import open_evaluation_set
+from lab.evaluation.places import measure_background
 from lab.evaluation.query_clusters import cluster_queries
 from lab.evaluation.sequences import (
     FrameResult,
@@ -54,10 +56,19 @@ from services.cli.output import JsonOption, Table
 from shared.errors import Misconfigured
 from shared.evaluation.bootstrap import bootstrap_intervals
 from shared.evaluation.calibration import expected_calibration_error
-from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
-from shared.evaluation.places.fit import PlaceSample, fit_place_model
+from shared.evaluation.places.evidence import (
+    EVIDENCE_DEPTH,
+    PhotoLocation,
+    RankedPhoto,
+    is_same_place,
+)
+from shared.evaluation.places.fit import MapScores, PlaceSample, fit_place_model
 from shared.evaluation.places.levels import LevelScheme, candidate_levels
-from shared.evaluation.places.probability import PlaceEstimate, PlaceModel
+from shared.evaluation.places.probability import (
+    MapExtent,
+    PlaceEstimate,
+    PlaceModel,
+)
 from shared.evaluation.places.samples import (
     IndexRanking,
     MatchOwnPhoto,
@@ -69,6 +80,7 @@ from shared.tracks.motion import MOTION_MODELS
 
 CERTAINTY = 0.95
 LEFT_OUT_GROUPS = 4
+FOREIGN_PHOTOS = 150  # of each other folder
 WALK = MOTION_MODELS["walk"]
 Mask = NDArray[np.bool_]
 
@@ -88,10 +100,14 @@ class DescribedPhotos:
     """(n,) clusters of the bootstrap"""
     scheme: LevelScheme
     radius_m: float
+    foreign: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    """(m, D) descriptors of photos of other sets, by the name of the set"""
     match: MatchOwnPhoto | None = None
     """compares photos of the set; None for estimates without matches"""
     dataset: EvaluationSet | None = None
     """the set, for its walks"""
+    extractor: str = ""
+    """of the descriptors, with a vocabulary fitted on the set"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +168,8 @@ def bench(
     measured = evaluation_folders(folders)
     with printed_report(f"estimates at certainty {CERTAINTY}", as_json) as (report, progress):
         for folder in measured:
-            measure_set(report, describe_set(folder, progress), splits, progress)
+            others = [other for other in measured if other != folder]
+            measure_set(report, describe_set(folder, progress, others), splits, progress)
 
 
 def measure_set(report: Report, photos: DescribedPhotos, splits: int, progress: Progress) -> None:
@@ -179,12 +196,14 @@ def measure_set(report: Report, photos: DescribedPhotos, splits: int, progress: 
         progress.advance(bar)
     if left_out:
         add_left_out(report, f"{photos.name}, labels left out", left_out)
+    for name, rows in photos.foreign.items():
+        add_foreign(report, f"{photos.name}, photos of {name}", photos, rows)
     if photos.dataset is not None and photos.scheme.labels_are_paths:
         add_walks(report, photos.dataset, photos)
 
 
-def describe_set(folder: Path, progress: Progress) -> DescribedPhotos:
-    """Describe an evaluation set as a new map would be."""
+def describe_set(folder: Path, progress: Progress, others: Sequence[Path] = ()) -> DescribedPhotos:
+    """Describe an evaluation set as a new map would be, and photos of other folders as queries."""
     # Decoder processes import the program, and their memory limit leaves no room for torch.
     from lab.cli.evaluation.describers import extractor_describer
     from lab.evaluation.ranking import describe_to_matrix
@@ -197,6 +216,12 @@ def describe_set(folder: Path, progress: Progress) -> DescribedPhotos:
     )
     with describe_to_matrix(describer.describe, [photo.path for photo in photos]) as rows:
         matrix = np.array(rows)
+    foreign = {}
+    for other in others:
+        paths = sorted(p for p in other.rglob("*") if p.suffix.lower() in (".jpg", ".png"))
+        shown = paths[:: max(1, len(paths) // FOREIGN_PHOTOS)]
+        with describe_to_matrix(describer.describe, shown) as rows:
+            foreign[other.name] = np.array(rows)
     is_path = any("/" in (photo.place or "") for photo in photos)
     return DescribedPhotos(
         dataset.name,
@@ -207,7 +232,9 @@ def describe_set(folder: Path, progress: Progress) -> DescribedPhotos:
         cluster_queries(photos).labels,
         LevelScheme(labels_are_paths=is_path, radii_m=settings.level_radii_m),
         settings.estimate_radius_m,
+        foreign=foreign,
         dataset=dataset,
+        extractor=describer.name,
     )
 
 
@@ -226,7 +253,9 @@ class TrialMap:
         self.photos = photos
         self._rows = photos.rows[self.members]
         scores = self._rows @ self._rows.T
+        self.background = measure_background(self._rows)
         self.locations = [photos.locations[index] for index in self.members]
+        self.extent = MapExtent.of(self.locations, photos.scheme)
         self.own_photos = OwnPhotoSampler(
             self.locations,
             [photos.captured_at[index] for index in self.members],
@@ -254,22 +283,35 @@ class TrialMap:
         """Fit the place model on the map's photos, and on photos of the set as labelled queries."""
         samples, spread = self.own_samples()
         labels = [sample for q in labelled if (sample := self.query_sample(q, spread)).levels]
-        model = fit_place_model(samples, labels, self.photos.scheme, spread).model
+        scores = MapScores(spread, self.background, self.extent, self.photos.extractor)
+        model = fit_place_model(samples, labels, self.photos.scheme, scores).model
         return model.model_copy(update={"with_matches": model}) if self.photos.match else model
 
     def estimate(self, query: int, model: PlaceModel) -> PlaceEstimate | None:
         """Estimate the place of a photo of the set; None without similar photos of known place."""
-        scheme, radius_m = self.photos.scheme, self.photos.radius_m
-        return model.estimate(*self.search(query), scheme, CERTAINTY, radius_m)
+        return self.estimate_row(self.photos.rows[query], model, query)
 
-    def search(self, query: int) -> tuple[list[RankedPhoto], list[RankedPhoto]]:
-        """Return the ranking of a photo of the set, and that of the best photo in it."""
-        found, scores = _rank(self._rows @ self.photos.rows[query])
+    def estimate_row(
+        self, row: NDArray[np.float32], model: PlaceModel, query: int | None = None
+    ) -> PlaceEstimate | None:
+        """Estimate the place of a photo by its (D,) descriptor; see `estimate`."""
+        scheme, radius_m = self.photos.scheme, self.photos.radius_m
+        return model.estimate(*self.search(row, query), scheme, CERTAINTY, radius_m)
+
+    def search(
+        self, row: NDArray[np.float32], query: int | None = None
+    ) -> tuple[list[RankedPhoto], list[RankedPhoto]]:
+        """Return the ranking of a (D,) descriptor, and that of the best photo in it.
+
+        Args:
+            query: Number of its photo in the set, to match it; None for a photo of another set.
+        """
+        found, scores = _rank(self._rows @ row)
         ranking = [
             RankedPhoto(score, self.locations[index], index)
             for index, score in zip(found[:EVIDENCE_DEPTH].tolist(), scores.tolist(), strict=False)
         ]
-        if self.photos.match:
+        if self.photos.match and query is not None:
             ranking = attach_matches(ranking, partial(self._match, query))
         return ranking, self.own_photos.neighbours(int(found[0]))
 
@@ -277,7 +319,10 @@ class TrialMap:
         """Return the sample of a photo of the set."""
         truth = self.photos.locations[query]
         levels = candidate_levels(
-            *self.search(query), self.photos.scheme, spread, self.photos.radius_m
+            *self.search(self.photos.rows[query], query),
+            self.photos.scheme,
+            spread,
+            self.photos.radius_m,
         )
         return PlaceSample(query, levels, [level.is_right(truth) for level in levels])
 
@@ -307,7 +352,9 @@ def fit_and_judge(
         estimate = trial.estimate(query, model)
         if estimate is not None:
             truth = photos.locations[query]
-            right = [level.is_right(truth) for level in estimate.levels]
+            # The whole map is judged by the photos of elsewhere.
+            right = [level.is_right(truth) for level in estimate.levels[:-1]]
+            right.append(any(is_same_place(truth, s, photos.radius_m) for s in trial.locations))
             judged.append(Judged(estimate, right, int(photos.clusters[query])))
     return judged
 
@@ -410,6 +457,23 @@ def add_left_out(report: Report, what: str, judged: Sequence[Judged]) -> None:
         what,
         Share("answered at the finest level", judged, lambda j: j.is_finest, at_most=most),
         Share("wrong at any level", judged, lambda j: j.is_answer_right is False),
+    )
+
+
+def add_foreign(
+    report: Report, what: str, photos: DescribedPhotos, rows: NDArray[np.float32]
+) -> None:
+    """Report the shares of photos of elsewhere that get an answer, and that are in the map."""
+    trial = TrialMap(photos, ~photos.is_query)
+    model = trial.fit()
+    estimates = [e for row in rows if (e := trial.estimate_row(row, model)) is not None]
+    judged = [Judged(e, [False] * len(e.levels), n) for n, e in enumerate(estimates)]
+    most = 100 * (1 - CERTAINTY)
+    _add_shares(
+        report,
+        what,
+        Share("answered", judged, lambda j: j.estimate.answer is not None, at_most=most),
+        Share("in the map", judged, lambda j: j.estimate.in_map is True, at_most=most),
     )
 
 

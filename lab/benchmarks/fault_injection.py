@@ -1,7 +1,4 @@
-"""Fault injection: a TCP proxy that simulates network and disk faults, and duplicated messages.
-
-Duplicates model Redis, which may deliver a Celery message twice after a lost acknowledgement.
-"""
+"""Fault injection: a TCP proxy that simulates network and disk faults, and duplicated messages."""
 
 from __future__ import annotations
 
@@ -218,9 +215,8 @@ class MessageDuplicator:
                 if stop.is_set():
                     return
                 words = seen["command"].split(" ", 2)
-                if words[0] != "LPUSH" or words[1] not in set(WakeupQueue):
-                    continue
-                if seen["client_port"] == own_port:
+                is_own = seen["client_port"] == own_port
+                if is_own or words[0] != "LPUSH" or words[1] not in set(WakeupQueue):
                     continue
                 # A waiting message as it lies there: MONITOR's own text is quoted.
                 message = pushing.lindex(words[1], 0)

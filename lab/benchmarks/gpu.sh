@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Measures on a GPU what the project promises for one, and writes one table. Ten minutes at most.
+# Measures extraction on a GPU, and search on the processors beside it. Ten minutes at most.
 #
 #   lab/benchmarks/gpu.sh [FOLDER]        results: FOLDER/gpu.md and a JSON file for each measurement
 #
@@ -47,6 +47,6 @@ for extractor in $extractors; do
     done
 done
 # shellcheck disable=SC2086  # a list of options
-SEARCH_DEVICE=$device measure 90-search search $search
+measure 90-search search $search
 "$python" -m lab.benchmarks.report "$folder" >"$folder/gpu.md"
 cat "$folder/gpu.md"

@@ -156,8 +156,9 @@ def integers_option(help_text: str, *names: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class LatencySummary:
-    """Percentiles of call durations, in seconds."""
+    """Percentiles of call durations, in seconds; other load affects `best` least."""
 
+    best: float
     median: float
     p95: float
     worst: float
@@ -169,7 +170,8 @@ class LatencySummary:
             raise ValueError("nothing was timed")
         ordered = sorted(seconds)
         last = len(ordered) - 1
-        return cls(median(ordered), ordered[min(last, int(0.95 * len(ordered)))], ordered[-1])
+        p95 = ordered[min(last, int(0.95 * len(ordered)))]
+        return cls(ordered[0], median(ordered), p95, ordered[-1])
 
 
 def _format_number(value: float) -> str:

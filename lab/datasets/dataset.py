@@ -69,6 +69,8 @@ class EvaluationSet:
     """The positive-match criterion, such as `radius 25 m`."""
     protocol: str
     """How the set was assembled: `placewise`, `msls-official`, `vme`."""
+    paired_by: str | None = None
+    """What numbers the photos of two seasons, in words; None for other sets"""
 
     def __post_init__(self) -> None:
         if len(self.positives) != len(self.queries):

@@ -172,6 +172,7 @@ def open_evaluation_set(
         positives=tuple(positives),
         rule=applied_rule,
         protocol=protocol or protocols[0],
+        paired_by=listed.paired_by,
     )
 
 

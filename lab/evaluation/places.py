@@ -19,8 +19,9 @@ from shared.evaluation.places.figures import (
     answer_figures,
     reliability_figures,
 )
-from shared.evaluation.places.fit import fit_place_model
+from shared.evaluation.places.fit import MapScores, fit_place_model
 from shared.evaluation.places.levels import LevelScheme, candidate_levels
+from shared.evaluation.places.probability import Background, MapExtent
 from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
 from shared.evaluation.places.thresholds import HeldOutEstimate
 
@@ -28,6 +29,7 @@ SAMPLED_PHOTOS = 1000
 """Database photos that the model is fitted on; as many as an evaluation of a live map draws"""
 RANKS = 800  # depth of the search for other places where hundreds of photos show the same one
 SEED = 0
+RANDOM_PAIRS = 4000
 
 
 class _RowRanker:
@@ -92,7 +94,8 @@ def measure_places(
         neighbours = {photo: own_photos.neighbours(photo) for photo in set(best)}
         if not ranker.search_requested():
             break
-    model = fit_place_model(samples, (), scheme, spread).model
+    scores = MapScores(spread, measure_background(database), MapExtent.of(locations, scheme))
+    model = fit_place_model(samples, (), scheme, scores).model
     estimates, outside = [], []
     for number, query in enumerate(evaluation_set.queries):
         truth = _photo_location(query)
@@ -108,9 +111,11 @@ def measure_places(
         levels = candidate_levels(ranking, around, scheme, unit, position_radius_m)
         if not levels or not truth.is_known:
             continue
-        right = [level.is_right(truth) for level in levels]
+        in_map = bool(len(evaluation_set.positives[number]))
+        levels = model.extent.end_levels(levels)
+        right = [*(level.is_right(truth) for level in levels[:-1]), in_map]
         estimates.append(HeldOutEstimate(*model.probabilities(levels), right, None, 1.0))
-        if not len(evaluation_set.positives[number]):
+        if not in_map:
             outside.append(estimates[-1])
     if not estimates:
         return None
@@ -130,6 +135,13 @@ def measure_places(
         ],
         "levels": [reliability_figures(estimates, position) for position in positions],
     }
+
+
+def measure_background(rows: Rows) -> Background:
+    """Return mean and deviation of the scores of random pairs of (n, D) unit descriptors."""
+    first, second = np.random.default_rng(SEED).integers(len(rows), size=(2, RANDOM_PAIRS))
+    apart = first != second
+    return Background.of(np.einsum("nd,nd->n", rows[first[apart]], rows[second[apart]]).tolist())
 
 
 def _photo_location(photo: DatasetPhoto) -> PhotoLocation:

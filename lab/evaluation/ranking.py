@@ -57,7 +57,7 @@ def describe_to_matrix(
         for batch in describe(photos):
             if done == 0:
                 rows = _allocate_rows(len(photos), batch.shape[1], stack)
-            _check_finite(batch, photos[done : done + len(batch)])
+            check_finite(batch, photos[done : done + len(batch)])
             rows[done : done + len(batch)] = batch
             done += len(batch)
             on_progress(done, len(photos))
@@ -76,7 +76,8 @@ def _allocate_rows(count: int, dimension: int, stack: contextlib.ExitStack) -> R
     return mapped
 
 
-def _check_finite(batch: Rows, photos: Sequence[Path]) -> None:
+def check_finite(batch: Rows, photos: Sequence[Any]) -> None:
+    """Raise Unprocessable (`features_not_finite`) for rows of photos with NaN or infinity."""
     finite = np.isfinite(batch).all(axis=1)
     if not finite.all():
         first = photos[int(np.flatnonzero(~finite)[0])]
@@ -89,16 +90,20 @@ def _check_finite(batch: Rows, photos: Sequence[Path]) -> None:
 
 
 def refused_photos_error(
-    refused: Sequence[tuple[Path, PlacewiseError]], photos: int
+    refused: Sequence[tuple[Any, PlacewiseError]], photos: int
 ) -> Unprocessable:
-    """Build the error that lists the photos that cannot be described, with reasons."""
-    lines = [f"{photo}: {error.detail}" for photo, error in refused[:MAX_PHOTOS_LISTED]]
-    if len(refused) > MAX_PHOTOS_LISTED:
-        lines.append(f"and {len(refused) - MAX_PHOTOS_LISTED} more")
+    """Build the error that lists the photos that can't be described, with reasons."""
+    named = [(str(photo).encode("utf-8", "replace").decode(), error) for photo, error in refused]
+    lines = [f"{photo}: {error.detail}" for photo, error in named[:MAX_PHOTOS_LISTED]]
+    if len(named) > MAX_PHOTOS_LISTED:
+        lines.append(f"and {len(named) - MAX_PHOTOS_LISTED} more")
     return Unprocessable(
         "photos_refused",
-        f"{len(refused)} of {photos} photos of the data set cannot be described. Repair or "
-        "download them again; metrics without them would not be comparable.\n" + "\n".join(lines),
+        f"{len(named)} of {photos} photos can't be described. Nothing was measured or written "
+        "without them.\n" + "\n".join(lines),
+        refused=[
+            {"photo": photo, "code": error.code, "detail": error.detail} for photo, error in named
+        ],
     )
 
 

@@ -185,7 +185,7 @@ def _cross_validated_confidence(
         if right + wrong < MIN_QUERIES or min(right, wrong) < MIN_QUERIES_PER_CLASS:
             return None
         mean, scale = float(scores[known].mean()), float(scores[known].std())
-        standard = PlacePrior(means=(mean,), scales=(scale or 1.0,), level=(), not_in_map=())
+        standard = PlacePrior(means=(mean,), scales=(scale or 1.0,), level=(), missing_place=())
         table = RegressionTable(
             scores[known, None], correct[known].astype(np.float64), np.ones(right + wrong)
         )

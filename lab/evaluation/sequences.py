@@ -21,11 +21,11 @@ from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.datasets.ground_truth import parse_rule
 from lab.evaluation.array_photo_graph import ArrayPhotoGraph
 from lab.evaluation.confidence_metrics import recall_at_precision
-from lab.evaluation.places import RANKS, SAMPLED_PHOTOS
+from lab.evaluation.places import RANKS, SAMPLED_PHOTOS, measure_background
 from lab.evaluation.seqslam import hmm_matches, seqslam_matches
 from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
-from shared.evaluation.places.fit import fit_place_model
+from shared.evaluation.places.fit import MapScores, fit_place_model
 from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
 from shared.place_paths import look_like_paths
@@ -141,7 +141,9 @@ def _fit_judge(
     size = min(SAMPLED_PHOTOS, len(known))
     sample = np.sort(np.random.default_rng(0).choice(known, size, replace=False)).tolist()
     spread = own_photos.spread(sample)
-    model = fit_place_model(list(own_photos.samples(sample, spread)), (), scheme, spread).model
+    scores = MapScores(spread, measure_background(rows))
+    samples = list(own_photos.samples(sample, spread))
+    model = fit_place_model(samples, (), scheme, scores).model
 
     def judge(scores: NDArray[np.float32]) -> float | None:
         order = np.argsort(-scores, kind="stable")

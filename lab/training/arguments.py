@@ -1,9 +1,8 @@
 """Arguments of `placewise train`: definition, validation, and YAML input and output.
 
 `TrainingArguments` is the single definition. pydantic parses and validates what flags and YAML
-files say; the flags and their help are generated from the model. The arguments of the original
-GSV-Cities code (aliyassine26/gsv-cities, `src/configs/args.py`) keep their names, meanings and
-defaults, including the misspelt `warmpup_steps`.
+files say; the flags and their help are generated from the model. Arguments keep their name, meaning
+and default of aliyassine26/gsv-cities (`src/configs/args.py`), also the misspelt `warmpup_steps`.
 
 Lists and dicts are JSON. The published GSV-Cities commands write some of them in Python notation,
 `(320, 320)` and `['sfxs_val']`, so both notations are accepted. An unknown key is an error that
@@ -23,6 +22,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
 
+from shared.descriptors.cached_weights import find_missing_weights
 from shared.errors import InvalidRequest, Misconfigured, NotFound, PlacewiseError
 
 
@@ -295,8 +295,7 @@ def suggest_name(name: str, known: Iterable[str]) -> str:
     return f" Known: {', '.join(names)}."
 
 
-GPU_DEVICE_FILES = ("nvidia*", "nvhost*", "kfd", "dxg")
-"""Files in /dev of NVIDIA's drivers, AMD's driver and WSL"""
+GPU_DEVICE_FILES = ("nvidia*", "nvhost*", "kfd", "dxg")  # in /dev: NVIDIA's, AMD's and WSL's
 
 
 def find_early_obstacles(arguments: TrainingArguments) -> list[PlacewiseError]:
@@ -308,7 +307,8 @@ def find_early_obstacles(arguments: TrainingArguments) -> list[PlacewiseError]:
     needs_data_root = arguments.experiment_phase != "test" or not arguments.eval_roots
     if arguments.data_root is None and needs_data_root:
         obstacles.append(data_root_error())
-    return obstacles
+    missing = find_missing_weights(arguments.backbone_arch, arguments.pretrained, arguments.weights)
+    return [*obstacles, *missing] if obstacles else []
 
 
 def combine_obstacles(obstacles: Sequence[PlacewiseError]) -> PlacewiseError:

@@ -14,7 +14,7 @@ from lab.evaluation.exact_knn import has_faiss_gpu
 from lab.evaluation.ranking import RecallEvaluation, evaluate_recall
 from lab.evaluation.results import predictions_path
 from lab.training.arguments import TrainingArguments
-from lab.training.model_describer import ModelDescriber
+from lab.training.describing import ModelDescriber
 from lab.training.run_control import StopRequest
 from lab.training.run_folder import VALIDATION_KS
 

@@ -11,12 +11,11 @@ from typing import Annotated
 from uuid import UUID
 
 import typer
-from rich.progress import Progress
 from rich.table import Column
 
 from placewise.answers import Evaluation
 from placewise.client import Client
-from services.cli.client import active_generation, connect, wait_for_job
+from services.cli.client import connect, wait_for_job
 from services.cli.environment import lab_missing
 from services.cli.output import (
     Json,
@@ -31,7 +30,6 @@ from services.cli.output import (
     print_table,
     progress_bar,
 )
-from shared.errors import Conflict
 
 MAX_EVALUATIONS_SHOWN = 6  # the current evaluation and earlier ones
 
@@ -40,14 +38,6 @@ SampleOption = Annotated[
     typer.Option(min=1, help="Live map: number of photos to query with. Default: 1000."),
 ]
 SeedOption = Annotated[int | None, typer.Option(min=0, help="Live map: random seed.")]
-WordWeightsOption = Annotated[
-    bool,
-    typer.Option(
-        "--word-weights",
-        help="Live map: first fit weights of visual words on the map's places, and keep them "
-        "if recall improves.",
-    ),
-]
 
 
 def evaluate(
@@ -55,7 +45,6 @@ def evaluate(
     predictions: Annotated[Path | None, typer.Option(hidden=True)] = None,
     sample: SampleOption = None,
     seed: SeedOption = None,
-    word_weights: WordWeightsOption = False,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
@@ -68,13 +57,12 @@ def evaluate(
     for option, value in (("--data", data), ("--predictions", predictions)):
         if value is not None:
             raise lab_missing(f"`evaluate {option}`")
-    evaluate_map(sample, seed, word_weights, map_name, server, key, as_json)
+    evaluate_map(sample, seed, map_name, server, key, as_json)
 
 
 def evaluate_map(
     sample: int | None,
     seed: int | None,
-    word_weights: bool,
     map_name: str | None,
     server: str | None,
     key: str | None,
@@ -83,33 +71,15 @@ def evaluate_map(
     """Evaluate a map with its own photos (leave-one-out) and its labelled queries."""
     options = {"sample": sample, "seed": seed}
     parameters = {name: value for name, value in options.items() if value is not None}
-    fitted_weights: Json | None = None
     with connect(server, map_name, key) as client, progress_bar() as progress:
-        if word_weights:
-            fitted_weights = _fit_word_weights(client, parameters, progress)
         job = wait_for_job(client, client.evaluate(**parameters), progress, "evaluating")
         requested = (e for e in client.evaluations() if not e.automatic)
         shown = list(islice(requested, MAX_EVALUATIONS_SHOWN))
         vocabularies = _vocabulary_origins(client)
     if as_json:
-        result = job.result or {}
-        print_json({**result, "word_weights": fitted_weights} if fitted_weights else result)
+        print_json(job.result or {})
         return
     _print_evaluations(shown, vocabularies)
-    if fitted_weights:
-        print_message(f"Word weights: {fitted_weights['outcome']}. {fitted_weights['reason']}")
-
-
-def _fit_word_weights(client: Client, parameters: dict[str, int], progress: Progress) -> Json:
-    """Fit word weights of the active generation; returns the job's result."""
-    active = active_generation(client)
-    if active is None:
-        raise Conflict(
-            "nothing_to_evaluate",
-            "The map has no photos with descriptors yet. Upload photos: placewise index.",
-        )
-    started = client.learn_word_weights(active.generation_id, **parameters)
-    return wait_for_job(client, started, progress, "word weights").result or {}
 
 
 def _vocabulary_origins(client: Client) -> dict[UUID, str]:
@@ -128,10 +98,7 @@ def _print_evaluations(evaluations: list[Evaluation], vocabularies: dict[UUID, s
     )
     for evaluation in evaluations:
         figures = evaluation.figures
-        rows = _recall_rows(figures)
-        if weighted := figures["with_word_weights"]:
-            rows += [(f"{kind}, word weights", recall) for kind, recall in _recall_rows(weighted)]
-        for kind, recall in rows:
+        for kind, recall in _recall_rows(figures):
             table.add_row(
                 f"{evaluation.evaluated_at:%m-%d %H:%M:%S}",
                 vocabularies.get(evaluation.generation_id, ""),
@@ -140,8 +107,7 @@ def _print_evaluations(evaluations: list[Evaluation], vocabularies: dict[UUID, s
                 *(format_percent(recall[f"R@{k}"]) for k in (1, 5, 10)),
             )
     print_table(table)
-    figures = evaluations[0].figures
-    used = figures["with_word_weights"] or figures
+    used = evaluations[0].figures
     if places := used["places"]:
         print_table(answers_table(places))
     if with_matches := used["places_with_matches"]:

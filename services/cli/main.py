@@ -37,9 +37,7 @@ PANELS = {
     "Descriptors and accuracy": {
         "vocabulary": "services.cli.descriptors.vocabulary:app",
         "models": "services.cli.descriptors.models:app",
-        "describe": "services.cli.descriptors.describe:describe",
         "evaluate": "services.cli.evaluate:evaluate",
-        "compare": "services.cli.compare:compare",
     },
     "Services": {
         "serve": "services.cli.operations.servers:serve",
@@ -51,15 +49,16 @@ PANELS = {
     "Operation": {
         "config": "services.cli.environment:config",
         "doctor": "services.cli.operations.doctor:doctor",
+        "jobs": "services.cli.jobs:jobs",
         "keys": "services.cli.operations.keys:app",
         "storage": "services.cli.operations.storage:app",
     },
 }
 # The lab's commands exist where `lab` stands beside `services`: in a clone of the repository, but
-# in no image. Its `evaluate` and `compare` replace those of the
-# service.
+# in no image. Its `evaluate` adds data sets to that of the service.
 LAB_PANEL = "Descriptors and accuracy"
 LAB_COMMANDS = {
+    "describe": "lab.cli.descriptors.describe:describe",
     "evaluate": "lab.cli.evaluation.commands:evaluate",
     "compare": "lab.cli.evaluation.commands:compare",
     "train": "lab.cli.training.commands:train",

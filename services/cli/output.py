@@ -38,7 +38,10 @@ from rich.text import Text
 
 from shared.errors import InvalidRequest, Misconfigured, PlacewiseError
 
-_REPLACED = dict.fromkeys((*range(0x20), *range(0x7F, 0xA0)), "\N{REPLACEMENT CHARACTER}")
+_CONTROLS = (*range(0x20), *range(0x7F, 0xA0), 0x2028, 0x2029)
+# Of the direction of text: photo<RIGHT-TO-LEFT OVERRIDE>gpj.exe would be shown as photoexe.jpg.
+_DIRECTIONS = (0x061C, 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A))
+_REPLACED = dict.fromkeys((*_CONTROLS, *_DIRECTIONS), "\N{REPLACEMENT CHARACTER}")
 _REPLACED_IN_LINES = {code: text for code, text in _REPLACED.items() if chr(code) not in "\n\t"}
 
 

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.progress_bar import ProgressBar
 from rich.table import Column
 
-from placewise.answers import CameraPose, Estimate, EstimateLevel, Matches, Similar
+from placewise.answers import CameraPose, Estimate, Matches, Similar
 from placewise.client import Client
 from services.cli.client import connect, describe_target
 from services.cli.output import (
@@ -61,13 +61,6 @@ def query(
         str | None,
         typer.Option(help="Only photos whose tags contain all of these comma-separated parts."),
     ] = None,
-    word_weights: Annotated[
-        bool,
-        typer.Option(
-            "--word-weights/--no-word-weights",
-            help="Rank by the map's word weights, if it has any.",
-        ),
-    ] = True,
     matches: Annotated[
         int | None,
         typer.Option(
@@ -115,6 +108,13 @@ def query(
             "finest level that is certain enough. Default: the server's CERTAINTY.",
         ),
     ] = None,
+    elsewhere: Annotated[
+        float | None,
+        typer.Option(
+            help="Share of your queries that are from elsewhere than the map, between 0 and 1. "
+            "Default: 0.33.",
+        ),
+    ] = None,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
@@ -140,8 +140,8 @@ def query(
             place=place,
             tags=tags,
             tags_like=tags_like,
-            word_weights=None if word_weights else False,
             certainty=certainty,
+            elsewhere=elsewhere,
         )
         target = describe_target(client, server, map_name)
         if explain:
@@ -149,13 +149,11 @@ def query(
     if as_json:
         print_json(answer)
         return
-    weighted = answer.word_weights == "applied"
     levels = answer.estimate.levels
     table = Table(
         "rank",
         Column("score", no_wrap=True),
         *([Column("match", justify="right", no_wrap=True)] if levels else []),
-        *([Column("weighted", no_wrap=True)] if weighted else []),
         *([Column("points", justify="right", no_wrap=True)] if answer.matches else []),
         Column("photo", overflow="fold"),
         Column("latitude", no_wrap=True),
@@ -167,7 +165,6 @@ def query(
             str(rank),
             f"{match.similarity_score:.4f}",
             *([format_percent(match.match_probability)] if levels else []),
-            *([_format_score(match.weighted_score)] if weighted else []),
             *([_format_count(match.inliers)] if answer.matches else []),
             escape(match.relative_path or match.original_filename),
             _format_degrees(match.latitude),
@@ -175,11 +172,9 @@ def query(
             escape(match.place or ""),
         )
     print_table(table)
+    print_message(_format_estimate(answer.estimate))
     if levels:
-        print_message(_summarize_levels(answer.estimate))
         print_table(_levels_table(answer.estimate))
-    else:
-        print_message(_format_estimate(answer.estimate))
     if answer.matches:
         print_message(_format_matches(answer.matches))
     if answer.no_pose is not None:
@@ -188,7 +183,7 @@ def query(
         print_table(_pose_table(answer.pose))
     print_message(
         f"{answer.rows_scanned} photos compared (certificate: {answer.certificate}), "
-        f"vocabulary: {answer.vocabulary}, word weights: {answer.word_weights}\n"
+        f"vocabulary: {answer.vocabulary}\n"
         f"Searched {target}"
     )
 
@@ -258,10 +253,6 @@ def _pose_table(pose: CameraPose) -> Table:
     return table
 
 
-def _format_score(value: float | None) -> str:
-    return "" if value is None else f"{value:.4f}"
-
-
 def _format_count(value: int | None) -> str:
     return "" if value is None else str(value)
 
@@ -272,28 +263,6 @@ def _format_matches(matches: Matches) -> str:
         return f"No matching points: {matches.reason}"
     missing = f"; {matches.missing} have no local features" if matches.missing else ""
     return f"{matches.compared} photos were matched{missing}."
-
-
-def _summarize_levels(estimate: Estimate) -> str:
-    """How sure the answer is, or why there is none, in one sentence."""
-    certainty = estimate.certainty or 0
-    # An answer that is finer than the coarsest level also requires odds against "not in this map".
-    is_unsure = any(
-        level.probability >= certainty for level in estimate.levels[: estimate.answer_level]
-    )
-    outside = estimate.not_in_map_probability or 0
-    if estimate.answer_level is None and outside > 0.5:
-        return f"{format_percent(outside)} sure that the map has no photo of this place."
-    if estimate.answer_level is None and not estimate.has_place:
-        return estimate.reason
-    level = estimate.levels[-1 if estimate.answer_level is None else estimate.answer_level]
-    sure = f"{format_percent(level.probability)} sure it is {_format_level(level)}"
-    if estimate.answer_level is not None:
-        clearer = " A finer answer needs clearer signs that the place is in the map."
-        return f"{sure}.{clearer if is_unsure else ''}"
-    if is_unsure:
-        return f"{sure}, but it is not clear whether the place is in the map."
-    return f"{sure}: an answer needs {100 * certainty:g} %."
 
 
 def _levels_table(estimate: Estimate) -> Table:
@@ -310,6 +279,8 @@ def _levels_table(estimate: Estimate) -> Table:
     )
     for level in estimate.levels:
         name = level.place or f"within {_format_m(level.radius_m or 0)}"
+        if level.whole_map:
+            name = "in this map"
         table.add_row(
             escape(name), format_percent(level.probability), _probability_bar(level.probability)
         )
@@ -329,28 +300,16 @@ def _probability_bar(probability: float) -> ProgressBar:
     )
 
 
-def _format_level(level: EstimateLevel) -> str:
-    if level.place is not None:
-        return f"in {level.place}"
-    position = f"{_format_degrees(level.latitude)}, {_format_degrees(level.longitude)}"
-    return f"within {_format_m(level.radius_m or 0)} of {position}"
-
-
 def _format_m(length_m: float) -> str:
     return f"{length_m:.0f} m" if length_m < 999.5 else f"{round(length_m / 1000, 1):g} km"
 
 
 def _format_estimate(estimate: Estimate) -> str:
-    """The estimate without levels, in one line."""
-    if estimate.in_map is False:
-        return estimate.reason
-    parts = [estimate.place] if estimate.place else []
+    """The headline, with the place that it does not name, and the reason."""
+    parts = [estimate.place] if estimate.place and not estimate.levels else []
     if estimate.latitude is not None:
-        parts.append(f"{estimate.latitude:.6f}, {estimate.longitude:.6f}")
-    if not parts:
-        return f"No estimate. {estimate.reason}"
-    confidence = "" if estimate.confidence is None else f", confidence {estimate.confidence:.0%}"
-    return f"Best guess: {'; '.join(parts)}{confidence}. {estimate.reason}"
+        parts.append(f"{_format_degrees(estimate.latitude)}, {_format_degrees(estimate.longitude)}")
+    return "\n".join([". ".join([estimate.headline, *parts]), estimate.reason])
 
 
 def _format_degrees(value: float | None) -> str:

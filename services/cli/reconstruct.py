@@ -37,6 +37,12 @@ from shared.errors import Conflict, InvalidRequest
 from shared.geometry.colmap_model import ColmapModel, read_colmap_model
 
 MAX_NAMES_SHOWN = 5
+NAMES_MEANING = {
+    "unmatched": "names of the model are not those of exactly one photo of the map",
+    "left_out": "photos are left out, because their camera has another shape than the photo, or "
+    "EXIF mirrors it",
+}
+"""Of the names in the result of an import"""
 
 
 class ProposalAction(StrEnum):
@@ -98,6 +104,8 @@ def reconstruct(
             "--images goes with --import; --anew and --proposals go with no other option.",
         )
     poses = read_colmap_model(model) if model else None  # fails before anything is uploaded
+    if model and (model / "images.bin").exists() and (model / "images.txt").exists():
+        print_note(f"{model} has text files, too. As COLMAP does, the binary files are read.")
     with ExitStack() as stack:
         client = stack.enter_context(connect(server, map_name, key))
         progress = stack.enter_context(progress_bar())
@@ -158,13 +166,11 @@ def _print_reconstruction(made: Reconstruction, result: Json) -> None:
         f"{result['reconstructed']} of {result['photos']} photos are in {len(made.components)} "
         "components."
     )
-    if left_out := result["left_out_names"]:
-        print_note(f"In no component: {_shorten(left_out)}")
-    if unmatched := result.get("unmatched_names"):
-        print_note(
-            f"{result['unmatched']} names of the model are not those of exactly one photo of the "
-            f"map: {_shorten(unmatched)}"
-        )
+    for what, meaning in NAMES_MEANING.items():
+        if names := result.get(f"{what}_names"):
+            shown = ", ".join(names[:MAX_NAMES_SHOWN]) + " ..." * (len(names) > MAX_NAMES_SHOWN)
+            why = meaning if made.imported else "photos are in no component"
+            print_note(f"{result[what]} {why}: {shown}")
 
 
 def _shorten(names: list[str]) -> str:

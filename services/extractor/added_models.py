@@ -15,12 +15,14 @@ import json
 import logging
 import math
 import os
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from services.extractor.child_process import ChildKilled, run_in_child
 from services.extractor.handlers import ExtractorContext, handles_model_change
 from shared.catalog.database.base import db_now
 from shared.catalog.database.session import Catalog
@@ -42,6 +44,7 @@ from shared.extractor_config.names import TORCHSCRIPT_PREFIX, TRAINED_MODEL_PREF
 from shared.ids import new_id
 from shared.jobs import Job, JobKind
 from shared.jobs.leases import lock_leased_job
+from shared.jobs.runner import JobInterrupted
 from shared.jobs.transitions import succeed_job
 from shared.storage import ObjectStore
 from shared.storage.copying import (
@@ -56,6 +59,7 @@ from shared.storage.keys import new_model_key
 log = logging.getLogger(__name__)
 
 MODEL_CACHE_BYTES = 10_000_000_000
+CHECK_SECONDS = 300.0  # of a TorchScript file, with the start of its process
 MAX_CARD_CHARACTERS = 20_000  # of the model card as JSON
 
 
@@ -132,7 +136,15 @@ def model_cache_folder(settings: Settings) -> Path:
 class AddedModelLoader:
     """Loads added models by name, as the catalog describes them."""
 
-    def __init__(self, catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
+    def __init__(
+        self,
+        catalog: Catalog,
+        store: ObjectStore,
+        settings: Settings,
+        is_stopping: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """`is_stopping` is whether a pass of an ONNX file must end (`OnnxProcess`)."""
+        self._is_stopping = is_stopping
         self._catalog = catalog
         self._settings = settings
         self._cache = ModelFileCache(store, model_cache_folder(settings), MODEL_CACHE_BYTES)
@@ -158,7 +170,14 @@ class AddedModelLoader:
             path = self._cache.local_path(row.object_key, row.sha256)
             if config.input is not None:
                 data = path.read_bytes()
-                return ExportedBackbone(config, data, device, licence=row.licence, card=row.card)
+                return ExportedBackbone(
+                    config,
+                    data,
+                    device,
+                    licence=row.licence,
+                    card=row.card,
+                    is_stopping=self._is_stopping,
+                )
             model = read_model_file(path)
         except NotFound as error:
             raise Unavailable(
@@ -191,7 +210,7 @@ def import_model(context: ExtractorContext, job: Job) -> None:
             if prefix is None:
                 new, data = _read_trained(load_checkpoint(path), filename, name)
             else:
-                new, data = _read_exported(context, job, prefix, path.read_bytes())
+                new, data = _read_exported(context, job, prefix, path)
         except Unprocessable as error:  # its message names the temporary file
             detail = error.detail.replace(path.name, filename)
             raise Unprocessable(error.code, detail, **error.extra) from error
@@ -239,7 +258,7 @@ def _read_trained(checkpoint: Checkpoint, filename: str, name: str) -> tuple[Mod
 
 
 def _read_exported(
-    context: ExtractorContext, job: Job, prefix: str, data: bytes
+    context: ExtractorContext, job: Job, prefix: str, path: Path
 ) -> tuple[Model, bytes]:
     """Return the row of an exported network, and its file, after checking the network."""
     options = job.params["options"]
@@ -248,20 +267,48 @@ def _read_exported(
         f"{name}:{options}" if options else name, allow_test_extractors=False
     )
     card = {"source": job.params["filename"]}
+    data = path.read_bytes()
     sha256 = hashlib.sha256(data).hexdigest()
     if prefix == TORCHSCRIPT_PREFIX:
         context.settings.check_torchscript_allowed(name, sha256)
-    backbone = ExportedBackbone(config, data, torch.device("cpu"), card=card)
+    if prefix == TORCHSCRIPT_PREFIX:
+        width = _check_torchscript(context, config, path)
+    else:  # runs in a process of its own
+        width = ExportedBackbone(
+            config, data, torch.device("cpu"), is_stopping=context.is_stopping
+        ).width
     assert config.input is not None
     size = config.input.height and [config.input.height, config.input.width]
     new = Model(
         name=name,
         fingerprint=sha256,
-        dimension=backbone.width,
+        dimension=width,
         config={"extractor": config.name, "image_size": size},
         card=card,
     )
     return new, data
+
+
+def _check_torchscript(context: ExtractorContext, config: ExtractorConfig, path: Path) -> int:
+    """Return the width of a network's output; a damaged file may end the process that loads it."""
+    deadline = time.monotonic() + CHECK_SECONDS
+
+    def check() -> None:
+        if context.is_stopping():
+            raise JobInterrupted
+        if time.monotonic() > deadline:
+            raise ChildKilled(f"it computes for more than {CHECK_SECONDS:g} s")
+
+    try:
+        return run_in_child(_load_width, config, path, on_progress=lambda: None, check=check)
+    except ChildKilled as error:
+        raise Unprocessable(
+            "model_unusable", f"The extractor {config.name} can't be used: {error}."
+        ) from error
+
+
+def _load_width(config: ExtractorConfig, path: Path, _report: Callable[..., None]) -> int:
+    return ExportedBackbone(config, path.read_bytes(), torch.device("cpu")).width
 
 
 @contextlib.contextmanager

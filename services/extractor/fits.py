@@ -44,7 +44,7 @@ from shared.descriptors.vocabulary_file import VocabularyFile
 from shared.errors import Conflict, NotFound, PlacewiseError, Unprocessable
 from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.imaging.preprocessing import Pixels
-from shared.jobs import Job, JobKind
+from shared.jobs import Job, JobKind, Wakeups
 from shared.jobs.progress import JobProgress
 from shared.jobs.runner import JobRunner, StepOutcome
 from shared.storage import ObjectStore
@@ -179,13 +179,14 @@ class FitWorker:
         name: str,
         on_outcome: Callable[[JobKind, StepOutcome, int], object],
         compute: ComputeFit = compute_in_child,
+        wakeups: Wakeups | None = None,
     ) -> None:
         self.context = context
         self._catalog = context.catalog
         self._models = context.models
         self._compute = compute
         self._runner = JobRunner(
-            context.catalog, context.settings, name, CHILD_PROCESS_JOBS, on_outcome
+            context.catalog, context.settings, name, CHILD_PROCESS_JOBS, on_outcome, wakeups
         )
 
     def run(self, stop: threading.Event) -> None:

@@ -7,13 +7,11 @@ ends a stage, because each of the three runs in another thread: batches are pipe
 from __future__ import annotations
 
 import contextlib
-import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import Any
 
 from services.extractor.decoder_pool import DecoderPool
 from services.extractor.model_registry import ModelRegistry
@@ -33,6 +31,8 @@ class ExtractorContext:
     settings: Settings
     models: ModelRegistry
     decoders: DecoderPool
+    is_stopping: Callable[[], bool]
+    """Whether the worker is to stop, so that a pass of a network of others is ended."""
 
 
 @dataclass(slots=True)
@@ -89,47 +89,3 @@ def handles_model_change(kind: JobKind) -> Callable[[ModelChange], ModelChange]:
         return change_model
 
     return register
-
-
-@dataclass(slots=True)
-class DrainStats:
-    """Statistics of one drain, as logs and Flower show them; several threads update it."""
-
-    maps: set[str] = field(default_factory=set)
-    claimed: int = 0
-    outcomes: Counter[str] = field(default_factory=Counter)
-    seconds: Counter[str] = field(default_factory=Counter)
-    interrupted: bool = False
-    """Whether the drain stopped while there was work left."""
-    _lock: threading.Lock = field(default_factory=threading.Lock)
-
-    def add_claim(self, jobs: Sequence[Job]) -> None:
-        """Count claimed jobs of one map."""
-        with self._lock:
-            self.maps.add(str(jobs[0].map_id))
-            self.claimed += len(jobs)
-
-    def add_batch(self, batch: JobBatch) -> None:
-        """Add the outcomes of a batch and the seconds of its steps."""
-        with self._lock:
-            self.outcomes.update(batch.outcomes)
-            self.outcomes["failed"] += batch.failed
-            self.seconds.update(batch.seconds)
-
-    @property
-    def succeeded(self) -> int:
-        return self.outcomes["succeeded"]
-
-    @property
-    def failed(self) -> int:
-        return self.outcomes["failed"]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the statistics as JSON, for logs and for Flower."""
-        return {
-            "maps": sorted(self.maps),
-            "claimed": self.claimed,
-            "succeeded": self.succeeded,
-            "failed": self.failed,
-            "seconds": {step: round(took, 3) for step, took in self.seconds.items()},
-        }

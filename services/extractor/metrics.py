@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Iterable, Iterator
 from functools import partial
 
@@ -56,6 +55,9 @@ class ExtractorMetrics:
             "until an operator acts; crashed: back in the queue, alone.",
             ["kind", "outcome"],
         )
+        self._failures = counter(
+            "failures", "Failed jobs by the code of the error.", ["kind", "reason"]
+        )
         self._stage_seconds = histogram(
             "stage_seconds",
             "Duration of a batch's stages in seconds.",
@@ -66,11 +68,6 @@ class ExtractorMetrics:
             "model_load_seconds",
             "Duration of loading an extractor in seconds.",
             buckets=LOAD_BUCKETS_SECONDS,
-        )
-        self._drain_seconds = histogram(
-            "drain_seconds",
-            "Duration in seconds of drains that claimed jobs.",
-            buckets=STAGE_BUCKETS_SECONDS,
         )
         self._draining = gauge("draining", "1 while the worker processes jobs.")
         registry.register(_DeviceMemoryCollector())
@@ -89,6 +86,8 @@ class ExtractorMetrics:
         """Record the outcomes of a batch and the seconds of its steps."""
         for outcome, jobs in (+batch.outcomes).items():
             self._jobs.labels(batch.kind, outcome).inc(jobs)
+        for reason, jobs in (+batch.reasons).items():
+            self._failures.labels(batch.kind, reason).inc(jobs)
         for step, seconds in batch.seconds.items():
             self._stage_seconds.labels(step).observe(seconds)
 
@@ -98,14 +97,9 @@ class ExtractorMetrics:
 
     @contextlib.contextmanager
     def measure_drain(self) -> Iterator[None]:
-        """Measure the duration of the block as a drain."""
-        started = time.perf_counter()
-        self._draining.set(1)
-        try:
+        """Show that the worker processes jobs while the block runs."""
+        with self._draining.track_inprogress():
             yield
-        finally:
-            self._draining.set(0)
-            self._drain_seconds.observe(time.perf_counter() - started)
 
 
 class _DeviceMemoryCollector(Collector):

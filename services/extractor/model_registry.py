@@ -81,7 +81,7 @@ class ModelRegistry:
         self._pass_limits = defaultdict[object, BatchSizeLimit](
             lambda: BatchSizeLimit(self._device)
         )
-        self._load_errors: dict[str, str] = {}
+        self._load_errors: dict[str, PlacewiseError] = {}
         self._update_state()
         self._centres: LRUCache[UUID, ClusterCentres] = LRUCache(MAX_VOCABULARIES)
         self._projections: LRUCache[UUID, PcaProjection] = LRUCache(MAX_WHITENINGS)
@@ -107,7 +107,7 @@ class ModelRegistry:
         try:
             yield
         except PlacewiseError as error:
-            self._load_errors[name] = error.code
+            self._load_errors[name] = error
             raise
         else:
             self._load_errors.pop(name, None)
@@ -119,7 +119,8 @@ class ModelRegistry:
         self.state: dict[str, Any] = {
             "device": self._device.type,
             "models": sorted(self._extractors),
-            "errors": dict(self._load_errors),
+            "errors": {name: error.code for name, error in self._load_errors.items()},
+            "error_details": {name: error.detail for name, error in self._load_errors.items()},
         }
 
     def extractor_of_generation(self, generation: Generation) -> Extractor:

@@ -60,8 +60,8 @@ def publish(
         for job, row in zip(ready, rows, strict=True):
             context.store.put(query_vector_key(job.id), encode_rows(row[np.newaxis]))
             if features and job.id in features.encoded:
-                file = encode_feature_file(features.rows([job]))
-                context.store.put(query_features_key(job.id), file)
+                key = query_features_key(job.id)
+                context.store.put(key, encode_feature_file(features.rows([job]), key))
     elif ready:
         written = write_chunk(
             context.store,
@@ -82,6 +82,7 @@ def publish(
         )
 
     batch.outcomes.update(context.catalog.run(commit))
+    batch.reasons.update(error.code for _, error in failed)
     log.info(
         "published: %d succeeded, %d failed",
         batch.outcomes["succeeded"],

@@ -6,6 +6,7 @@ read from the catalog and are therefore the same on every gateway.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Sequence
 from functools import partial
 
@@ -109,6 +110,7 @@ class _LoadCollector(Collector):
         self._catalog = gateway.catalog
         self._connections = gateway.connections
         self._admission = admission
+        self._wakeups = gateway.wakeups
         self._job_counts = PolledValue(self._count_jobs, QUEUE_POLL_SECONDS)
 
     def _count_jobs(self) -> Sequence[tuple[str, str, int, float]] | None:
@@ -144,6 +146,8 @@ class _LoadCollector(Collector):
                 "Free bytes of the local disks that Placewise writes to.",
                 value=free_bytes,
             )
+        redis_up = float(self._wakeups.problem is None)
+        yield _gauge("redis_up", "1 if Redis takes messages, or none is used.", value=redis_up)
         queue = self._job_counts.get()
         yield _gauge("catalog_up", "1 if the catalog is reachable.", value=float(queue is not None))
         if queue is None:
@@ -164,6 +168,12 @@ class _LoadCollector(Collector):
             oldest.add_metric([job_kind, state], oldest_seconds)
         yield jobs
         yield oldest
+        with contextlib.suppress(SQLAlchemyError):
+            yield _gauge(
+                "extractors_stalled",
+                "1 if a job waits much longer than usual while none is finished.",
+                value=float(self._admission.queue_depth().is_stalled),
+            )
 
 
 def _gauge(

@@ -63,10 +63,16 @@ class SecurityHeadersMiddleware:
 
 
 MAX_JSON_BYTES = 1_000_000
+BYTES_PER_VALUE = 16
+"""A body of at most N bytes may have N / 16 values: `[],` takes 64 bytes of memory."""
+VALUE_MARKS = (b",", b"[", b"{")
 
 
 class BodySizeLimitMiddleware:
-    """Responds 413 (`body_too_large`) to bodies over MAX_JSON_BYTES without reading the rest.
+    """Responds 413 to large bodies without reading the rest.
+
+    `body_too_large` for more than MAX_JSON_BYTES, `too_many_values` for more values in them than
+    bodies of that size need.
 
     Args:
         form_paths: Matches the paths of the routes that limit multipart bodies themselves. Any
@@ -93,20 +99,34 @@ class BodySizeLimitMiddleware:
             await self._app(scope, receive, send)
             return
         limit = self._limits.get(scope["path"], MAX_JSON_BYTES)
-        size = 0
+        max_values = limit // BYTES_PER_VALUE
+        size = values = 0
+        error: TooLarge | None = None
 
         async def counted_receive() -> Message:
-            nonlocal size
+            nonlocal size, values, error
             message = await receive()
-            size += len(message.get("body", b""))
+            body = message.get("body", b"")
+            size += len(body)
+            values += sum(map(body.count, VALUE_MARKS))
+            if size > limit:
+                error = TooLarge("body_too_large", f"The body is larger than {limit} bytes.")
+            elif values > max_values:
+                error = TooLarge(
+                    "too_many_values",
+                    f"The body has more than {max_values} values. Split it, or send less.",
+                )
+                while message.get("more_body") and size <= limit:
+                    # Many clients read no response before they have sent their body.
+                    message = await receive()
+                    size += len(message.get("body", b""))
             # The route sees a client disconnect; its response is replaced by the 413.
-            return message if size <= limit else {"type": "http.disconnect"}
+            return message if error is None else {"type": "http.disconnect"}
 
         async def guarded_send(message: Message) -> None:
-            if size <= limit:
+            if error is None:
                 await send(message)
             elif message["type"] == "http.response.start":
-                error = TooLarge("body_too_large", f"The body is larger than {limit} bytes.")
                 await problem_response(error, Request(scope))(scope, receive, send)
 
         await self._app(scope, counted_receive, guarded_send)

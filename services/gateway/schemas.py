@@ -23,12 +23,6 @@ from shared.jobs import Job, JobKind, JobState
 from shared.search_api.protocol import PointPair, SeenPoint
 
 
-class RequestModel(BaseModel):
-    """A JSON body; unknown fields are refused."""
-
-    model_config = ConfigDict(extra="forbid")
-
-
 class ResponseModel(BaseModel):
     model_config = ConfigDict(frozen=True, from_attributes=True, populate_by_name=True)
 
@@ -101,11 +95,6 @@ class PhotoDetailResponse(PhotoResponse):
 
 class SimilarPhotoResponse(PhotoResponse):
     similarity_score: float = Field(description="cosine similarity in [-1, 1]")
-    weighted_score: float | None = Field(
-        None,
-        description="cosine similarity with word weights, if the result is ranked by it; null if "
-        "it is ranked by `similarity_score`",
-    )
     match_probability: float | None = Field(
         None,
         description="probability that the photo shows the query's place, at the finest of the "
@@ -143,35 +132,40 @@ class EstimateLevelResponse(ResponseModel):
     latitude: float | None = Field(None, description="centre of the circle, degrees")
     longitude: float | None = None
     radius_m: float | None = None
+    whole_map: bool = Field(False, description="the level is the whole map: 'in this map'")
     probability: float = Field(description="probability that the query was taken there")
 
 
 class EstimateResponse(ResponseModel):
     """Estimate of the place that the query photo shows, with a confidence."""
 
-    in_map: bool | None = Field(None, description="false: not in this map; null: not known yet")
-    latitude: float | None = None
+    headline: str = Field(description="the answer in one sentence")
+    in_map: bool | None = Field(
+        None,
+        description="true: `certainty` is reached; false: 'not in this map' is more probable; "
+        "null: neither, or not known yet",
+    )
+    latitude: float | None = Field(
+        None,
+        description="position of the pose, if there is one, else of the answered level, or of the "
+        "finest one as a guess; null if `in_map` is false",
+    )
     longitude: float | None = None
     radius_m: float | None = Field(
-        None,
-        description="tolerance in metres: the estimate is right if the true position is within it",
+        None, description="the place is right if the true position is within so many metres"
     )
-    place: str | None = None
-    has_place: bool = Field(
-        False,
-        description="whether there is a place to name: an answer or a guess; false if "
-        "`in_map` is false and the finest level is less probable than 10 %",
-    )
+    place: str | None = Field(None, description="label of that level")
+    has_place: bool = Field(False, description="whether there is a place: an answer or a guess")
     confidence: float | None = Field(
-        None,
-        description="probability that the place named here is right: that of the finest level; "
-        "null without levels",
+        None, description="probability that the place is right; null without levels"
     )
     reason: str
     levels: list[EstimateLevelResponse] = Field(
         [],
         description="levels of the estimate, finest first; each contains the finer ones and is at "
-        "least as probable; empty before the first evaluation of 20 or more photos with a place",
+        "least as probable; the last one is the whole map, and adds up to 1 with "
+        "`not_in_map_probability`; empty before the first evaluation of 20 or more photos with "
+        "a place",
     )
     answer_level: int | None = Field(
         None,
@@ -180,8 +174,11 @@ class EstimateResponse(ResponseModel):
     certainty: float | None = Field(
         None, description="share of the answers that must be right, as requested"
     )
+    elsewhere: float | None = Field(
+        None, description="prior probability that a query is from elsewhere, as requested"
+    )
     not_in_map_probability: float | None = Field(
-        None, description="probability that the map has no photo of the query's place"
+        None, description="probability that the query is from elsewhere"
     )
     radius_68_m: float | None = Field(
         None,
@@ -283,10 +280,6 @@ class SimilarityResponse(ResponseModel):
         "them; `foreign`: fitted on other photos; `pending`: descriptors are GeM-pooled until the "
         "map has a vocabulary; `none`: the extractor uses none"
     )
-    word_weights: str = Field(
-        description="`applied`: ranked by `weighted_score`; `none`: the generation has no weights, "
-        "or the query has no words with weights; `off`: disabled by the request"
-    )
     generation_id: UUID
     rows: RowType = Field(
         description="type of the stored descriptors, for which scores are exact: `float32` or "
@@ -353,7 +346,6 @@ JOB_LABELS = {
     JobKind.ADD_MODEL: "New model",
     JobKind.RECONSTRUCT: "Reconstruction",
     JobKind.EVALUATE: "Evaluation",
-    JobKind.WORD_WEIGHTS: "Word weights",
     JobKind.BATCH: "Batch",
 }
 
@@ -376,7 +368,11 @@ class JobResponse(ResponseModel):
     )
     progress: JobProgress
     attempts: int
+    map: str
     file_id: UUID | None = Field(validation_alias="photo_id")
+    filename: str | None = Field(
+        description="name of the photo, or of the uploaded vocabulary or checkpoint"
+    )
     result: dict[str, Any] | None
     error: dict[str, Any] | None = Field(description="an RFC 9457 problem")
     created_at: datetime
@@ -389,12 +385,15 @@ class JobResponse(ResponseModel):
     )
 
     @classmethod
-    def of(cls, job: Job, map_name: str) -> JobResponse:
+    def of(cls, job: Job, map_name: str, filename: str | None) -> JobResponse:
+        """Build the response; `filename` is that of its photo or uploaded file, if it has one."""
         is_query = job.kind == JobKind.DESCRIBE
         return cls.of_row(
             job,
             label=JOB_LABELS[JobKind(job.kind)],
             progress=JobProgress.model_validate(job),
+            map=map_name,
+            filename=filename,
             result=None if is_query else job.result,
             status_url=job_url(job.id, map_name),
             result_url=job_url(job.id, map_name, "/result") if is_query else None,
@@ -444,7 +443,10 @@ class UploadResponse(ResponseModel):
     upload_time: datetime
     status: JobState
     status_url: str
-    already_there: bool = Field(description="the map already has these bytes; nothing was stored")
+    already_there: bool = Field(description="the map already has this picture; no photo was added")
+    updated: list[str] = Field(
+        description="values of the map's photo that new metadata of its file has set"
+    )
     message: str
 
 

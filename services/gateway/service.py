@@ -51,8 +51,8 @@ def serve_gateway(settings: Settings, announce: Announce) -> None:
         server = http_server(
             create_app(context), context.connections, on_stop=context.job_notifier.begin_shutdown
         )
-        announce(f"Placewise gateway serves {url}")
         with serve_metrics(settings, context.registry), stop_on_signals(server):
+            announce(f"Placewise gateway serves {url}")
             server.run(sockets=[listener])
 
 

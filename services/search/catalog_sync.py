@@ -8,6 +8,7 @@ was last known to be current.
 
 from __future__ import annotations
 
+import errno
 import logging
 import threading
 import time
@@ -44,6 +45,7 @@ log = logging.getLogger(__name__)
 
 MIN_CODED_BYTES = 64_000_000  # of rows; smaller generations are scanned faster without codes
 
+FULL_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT)
 SYNCED_STATES = (GenerationState.ACTIVE, GenerationState.BUILDING)
 
 
@@ -105,16 +107,19 @@ def sync_snapshot(
     changes = {photo.photo_id: photo for photo in changed}
     loaded: list[LoadedChunk] = []
     missing: list[str] = []
+    disk_full = False
     for chunk in chunks:
         if chunk.id in known:
             loaded.append(_apply_photo_changes(known[chunk.id], changes))
             continue
         if chunk.id not in filter_values:
             missing.append(chunk.object_key)
+            disk_full |= old is not None and old.disk_full
             continue
         try:
             stored = loader.load_rows(chunk)
         except (Unavailable, NotFound, ValueError, OSError) as error:
+            disk_full |= isinstance(error, OSError) and error.errno in FULL_DISK_ERRORS
             unreadable.failed(chunk.object_key, error)
             missing.append(chunk.object_key)
             continue
@@ -125,19 +130,17 @@ def sync_snapshot(
     long_rows = any(chunk.rows.shape[1] >= CODED_DIMENSION for chunk in loaded)
     if long_rows and (large or (old is not None and old.has_sign_codes)):
         loaded = _with_codes(loader, loaded)
-    else:
-        compile_kernel(loaded)
     loader.evict_except(loaded)
-    return _apply_memory_budget(
-        memory_budget,
-        Snapshot(
-            generation_id=generation_id,
-            map_id=generation.map_id,
-            version=version,
-            chunks=tuple(loaded),
-            missing=tuple(missing),
-        ),
+    snapshot = Snapshot(
+        generation_id=generation_id,
+        map_id=generation.map_id,
+        version=version,
+        chunks=tuple(loaded),
+        missing=tuple(missing),
+        disk_full=disk_full,
     )
+    compile_kernel(snapshot)
+    return _apply_memory_budget(memory_budget, snapshot)
 
 
 def _apply_memory_budget(memory_budget: MemoryBudget, snapshot: Snapshot) -> Snapshot:

@@ -1,26 +1,26 @@
-"""Dense scan: exact comparison of a query with every selected row."""
+"""Dense scan: comparison of a query with every selected row.
+
+Products in float32 rule out the rows that cannot be in the result, whatever the rounding of their
+sums; the others are compared in float64. The rows are read as they are stored, by a compiled kernel
+on all CPUs: BLAS and faiss multiply float32 only. A copy for them takes twice the memory of float16
+rows, and twice the bytes have to be read.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
-from services.search.chunk_loader import LoadedChunk
+from services.search.snapshot import Snapshot
+from shared.storage.chunks import NORM_TOLERANCE
 
-# Upper bound of the error of float32 dot products of unit rows at 98,304 dimensions (measured
-# 4e-7): candidates this close to the k-th score are scored again in float64 before ranking.
-FLOAT32_MARGIN = 1e-5
-FLOAT64_MARGIN = 1e-12  # scores are rounded to as much, and equal ones ordered by photo
+# NumPy converts as many float16 numbers in 2 ms. It is used up to this size of a snapshot, because
+# importing and compiling the kernel takes a second.
+NUMPY_NUMBERS = 1_000_000
 
-# NumPy converts as many float16 numbers in 2 ms, but ten times as slowly as it multiplies. More are
-# multiplied in float64 by a compiled kernel, whose import takes a second.
-NUMPY_FLOAT16_NUMBERS = 1_000_000
-
-# Selecting rows copies them, which pays up to this share of a chunk; beyond, all are multiplied.
-GATHER_SHARE = 0.25
+ROUNDING = 2.0**-24  # relative error of a float32 operation
 
 QueryRow = NDArray[np.float32]
 RowNumbers = NDArray[np.int64]
@@ -28,94 +28,90 @@ Scores = NDArray[np.float64]
 
 
 def scan_top_k(
-    chunks: Sequence[LoadedChunk], query: QueryRow, k: int, row_mask: NDArray[np.bool_]
+    snapshot: Snapshot, query: QueryRow, k: int, row_mask: NDArray[np.bool_]
 ) -> tuple[RowNumbers, Scores]:
     """Find all rows that can be among the k most similar ones.
 
     Args:
-        chunks: Chunks of n rows in total; rows are unit vectors or zero.
+        snapshot: Snapshot of n rows; rows are unit vectors or zero.
         query: (dimension,) row of any length but 0.
         k: Number of results.
-        row_mask: (n,) bool, the rows that may be returned, in the chunks' order; at least one.
+        row_mask: (n,) bool, the rows that may be returned; at least one.
 
     Returns:
         Row numbers and float64 cosines, unsorted; at least `k` rows if as many are selected.
     """
-    rows, scores, margin = _score_rows(chunks, query, row_mask)
+    rows, scores = _float32_scores(snapshot, query, row_mask)
     k = min(k, len(scores))
     kth = np.partition(scores, len(scores) - k)[len(scores) - k]
-    return _select(chunks, query, rows, scores, kth, margin)
+    # The k-th row may have lost as much as another row has gained.
+    return _rescore(snapshot, query, rows, scores, kth - float32_error(len(query)))
 
 
-def scan_min_score(
-    chunks: Sequence[LoadedChunk], query: QueryRow, min_score: float, row_mask: NDArray[np.bool_]
+def exact_scores(snapshot: Snapshot, query: QueryRow, rows: RowNumbers) -> Scores:
+    """Return the float64 cosines of the given rows; those of equal rows are equal."""
+    products: Scores = _multiply(snapshot, rows, query, np.float64)
+    return products / _length(query)
+
+
+def float32_error(dimension: int) -> float:
+    """Return the largest error of a float32 cosine, whatever the order of its sum.
+
+    N. J. Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.1: the error of
+    a product of n numbers is at most n u / (1 - n u) times the lengths of the two vectors. One more
+    rounding is that of the query's numbers. Rows are as long as `rows_are_valid` permits.
+    """
+    roundings = (dimension + 1) * ROUNDING
+    return (1 + NORM_TOLERANCE) * roundings / (1 - roundings)
+
+
+def compile_kernel(snapshot: Snapshot) -> None:
+    """Compile what scans of the snapshot use, so that no query waits for it."""
+    if _uses_kernel(snapshot):
+        query, row = np.ones(snapshot.dimension, np.float32), np.zeros(1, np.int64)
+        for kind in (np.float32, np.float64):
+            _multiply(snapshot, row, query, kind)
+
+
+def _rescore(
+    snapshot: Snapshot, query: QueryRow, rows: RowNumbers, scores: NDArray[Any], min_score: float
 ) -> tuple[RowNumbers, Scores]:
-    """Find all rows whose cosine may be at least `min_score`; see `scan_top_k`."""
-    rows, scores, margin = _score_rows(chunks, query, row_mask)
-    return _select(chunks, query, rows, scores, min_score, margin)
-
-
-def _select(
-    chunks: Sequence[LoadedChunk],
-    query: QueryRow,
-    rows: RowNumbers,
-    scores: NDArray[Any],
-    min_score: float,
-    margin: float,
-) -> tuple[RowNumbers, Scores]:
-    """Return the rows whose score may be at least `min_score`, and their float64 cosines."""
+    """Return the rows whose cosine may be at least `min_score`, and their float64 cosines."""
     # Answers have no score above 1, which a float16 row may exceed: such rows are equal.
-    near = scores >= min(min_score, 1.0) - margin
-    if margin == FLOAT64_MARGIN:
-        return rows[near], scores[near]
-    return rows[near], exact_scores(chunks, query, rows[near])
+    near = rows[scores >= min(min_score, 1.0) - float32_error(len(query))]
+    return near, exact_scores(snapshot, query, near)
 
 
-def exact_scores(chunks: Sequence[LoadedChunk], query: QueryRow, rows: RowNumbers) -> Scores:
-    """Return the float64 cosines of the given rows."""
-    unit = _normalize(query)
-    firsts = np.cumsum([0, *(len(chunk.rows) for chunk in chunks)])
+def _float32_scores(
+    snapshot: Snapshot, query: QueryRow, row_mask: NDArray[np.bool_]
+) -> tuple[RowNumbers, NDArray[Any]]:
+    """Return the selected row numbers, and their cosines summed in float32."""
+    unit = (query / _length(query)).astype(np.float32)
+    rows = np.flatnonzero(row_mask)
+    return rows, _multiply(snapshot, rows, unit, np.float32)
+
+
+def _multiply(
+    snapshot: Snapshot, rows: RowNumbers, query: QueryRow, kind: DTypeLike
+) -> NDArray[Any]:
+    """Return the products of the given rows with the query, summed in this type."""
+    products = np.empty(len(rows), kind)
+    if _uses_kernel(snapshot):
+        snapshot.row_blocks.multiply(rows, query, products)
+        return products
+    firsts = snapshot.photos.first_rows
     of_chunk = np.searchsorted(firsts, rows, side="right") - 1
-    places = zip(of_chunk.tolist(), (rows - firsts[of_chunk]).tolist(), strict=True)
-    return np.array([chunks[chunk].rows[row].astype(np.float64) @ unit for chunk, row in places])
+    for chunk in np.unique(of_chunk).tolist():
+        here = of_chunk == chunk
+        stored = snapshot.chunks[chunk].rows[rows[here] - firsts[chunk]]
+        products[here] = np.vecdot(stored.astype(kind), query.astype(kind))
+    return products
 
 
-def _score_rows(
-    chunks: Sequence[LoadedChunk], query: QueryRow, row_mask: NDArray[np.bool_]
-) -> tuple[RowNumbers, NDArray[Any], float]:
-    """Return the selected row numbers, their cosines, and the margin of equal ones."""
-    selected = np.flatnonzero(row_mask)
-    has_float16 = any(chunk.rows.dtype == np.float16 for chunk in chunks)
-    if has_float16 and len(selected) * len(query) > NUMPY_FLOAT16_NUMBERS:
-        return selected, _kernel_cosines(chunks, query, selected), FLOAT64_MARGIN
-    unit = _normalize(query).astype(np.float32)
-    scores: list[NDArray[Any]] = []
-    first = 0
-    for chunk in chunks:
-        rows = np.flatnonzero(row_mask[first : first + len(chunk.rows)])
-        if len(rows):
-            gather = has_float16 or len(rows) <= GATHER_SHARE * len(chunk.rows)
-            scores.append(chunk.rows[rows] @ unit if gather else (chunk.rows @ unit)[rows])
-        first += len(chunk.rows)
-    return selected, np.concatenate(scores), FLOAT32_MARGIN
-
-
-def _kernel_cosines(chunks: Sequence[LoadedChunk], query: QueryRow, rows: RowNumbers) -> Scores:
-    from services.search.exact_rerank import RowBlocks  # importing numba is slow
-
-    products = np.empty(len(rows))
-    RowBlocks.of(chunks).multiply(rows, query, products)
-    return products / np.linalg.norm(query.astype(np.float64))
-
-
-def compile_kernel(chunks: Sequence[LoadedChunk]) -> None:
-    """Compile what scans of these chunks use, so that no query waits for it."""
-    float16 = [chunk for chunk in chunks if chunk.rows.dtype == np.float16]
-    if sum(chunk.rows.size for chunk in float16) > NUMPY_FLOAT16_NUMBERS:
-        query = np.ones(float16[0].rows.shape[1], np.float32)
-        _kernel_cosines(float16, query, np.zeros(1, np.int64))
-
-
-def _normalize(query: QueryRow) -> Scores:
+def _length(query: QueryRow) -> np.float64:
     exact = query.astype(np.float64)
-    return exact / np.linalg.norm(exact)
+    return np.float64(np.sqrt(exact @ exact))
+
+
+def _uses_kernel(snapshot: Snapshot) -> bool:
+    return len(snapshot.photos) * snapshot.dimension > NUMPY_NUMBERS

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.search.chunk_loader import LoadedChunk
-from services.search.kernels import exact_products
+from services.search.kernels import row_products
 
 Addresses = NDArray[np.uint64]
 Indices = NDArray[np.int64]
@@ -55,14 +55,19 @@ class RowBlocks:
     def __len__(self) -> int:
         return int(self.first_rows[-1])
 
-    def multiply(self, rows: Indices, query: NDArray[np.float32], out: Scores) -> None:
-        """Write the exact products of the given rows with the query to `out`, on all CPUs."""
+    def multiply(
+        self, rows: Indices, query: NDArray[np.float32], out: NDArray[np.floating]
+    ) -> None:
+        """Write the products of the given rows with the query to `out`, on all CPUs.
+
+        They are summed in the type of `out`, float32 or float64.
+        """
         parallel_for(
-            lambda i, j: exact_products(
+            lambda i, j: row_products(
                 self.row_addresses, self.first_rows, self.number_bytes, rows[i:j], query, out[i:j]
             ),
             len(rows),
-            4 * self.dimension,
+            int(self.number_bytes.max()) * self.dimension,
         )
 
 
@@ -83,7 +88,10 @@ def parallel_for(run_range: Callable[[int, int], None], rows: int, bytes_each: i
         rows: Number of rows.
         bytes_each: Bytes of work for each row, which determine the number of parts.
     """
-    parts = max(1, min(_cpu_count(), rows * bytes_each // MIN_PART_BYTES))
+    parts = min(_cpu_count(), rows * bytes_each // MIN_PART_BYTES)
+    if parts <= 1:
+        run_range(0, rows)
+        return
     ends = [rows * (part + 1) // parts for part in range(parts)]
     others = [_thread_pool().submit(run_range, *span) for span in pairwise(ends)]
     run_range(0, ends[0])

@@ -1,18 +1,19 @@
 """Query executor: runs a query on a snapshot with the cheapest suitable search strategy.
 
-The strategies are the dense scan, sign codes and the GPU. All compare the best candidates exactly
+The strategies are the dense scan and sign codes. Both compare the best candidates exactly
 and rank by float64 cosines; they differ in the certificate of the result.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search.dense_scan import QueryRow, exact_scores, scan_min_score, scan_top_k
+from services.search.dense_scan import QueryRow, scan_top_k
 from services.search.query_batcher import QueryBatcher
 from services.search.snapshot import Snapshot
 from shared.search_api.protocol import (
@@ -65,7 +66,6 @@ def execute_query(
     row_mask: NDArray[np.bool_],
     options: SearchOptions,
     batcher: QueryBatcher,
-    weighted_query: QueryRow | None = None,
 ) -> SearchResponse:
     """Search the rows of a snapshot that are most similar to a query.
 
@@ -75,35 +75,12 @@ def execute_query(
         row_mask: (n,) bool, the rows that may be returned.
         options: Number of results, minimum score and strategy.
         batcher: Batches the first-level scans of concurrent queries.
-        weighted_query: If given, rows are ranked by their similarity to it. Hits also carry the
-            plain cosine, and `options.min_score` applies to that.
     """
-    selected = int(np.count_nonzero(row_mask))
-    plain = _Query(snapshot, query, row_mask, options, batcher)
-    if not selected or not query.any():
-        return plain.to_response([], _ScoredRows(NO_ROWS, NO_SCORES, EXHAUSTIVE, 0))
-    if weighted_query is None:
-        scored = plain.score_rows()
-        hits = [
-            SearchHit(photo_id=photo_id, score=score)
-            for photo_id, _, score in plain.rank_photos(scored)
-        ]
-        return plain.to_response(hits, scored)
-    if options.min_score is not None:
-        row_mask = plain.mask_min_score()
-    if not row_mask.any():
-        return plain.to_response([], _ScoredRows(NO_ROWS, NO_SCORES, EXHAUSTIVE, selected))
-    weighted = _Query(snapshot, weighted_query, row_mask, replace(options, min_score=None), batcher)
-    scored = weighted.score_rows()
-    ranked = weighted.rank_photos(scored)
-    plain_scores = _round_scores(
-        exact_scores(snapshot.chunks, query, np.array([row for _, row, _ in ranked]))
-    )
-    hits = [
-        SearchHit(photo_id=photo_id, score=score, weighted_score=weighted_score)
-        for (photo_id, _, weighted_score), score in zip(ranked, plain_scores.tolist(), strict=True)
-    ]
-    return plain.to_response(hits, replace(scored, scanned=selected))
+    search = _Query(snapshot, query, row_mask, options, batcher)
+    if not search.selected or not query.any():
+        return search.to_response([], _ScoredRows(NO_ROWS, NO_SCORES, EXHAUSTIVE, 0))
+    scored = search.score_rows()
+    return search.to_response(search.rank_photos(scored), scored)
 
 
 def sign_codes_pay_off(selected: int, k: int) -> bool:
@@ -114,7 +91,7 @@ def sign_codes_pay_off(selected: int, k: int) -> bool:
     return selected > 64 + 4 * k
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class _Query:
     """A query of a snapshot, and the strategies that score its rows."""
 
@@ -126,39 +103,19 @@ class _Query:
 
     def score_rows(self) -> _ScoredRows:
         """Score the rows with the cheapest suitable strategy."""
-        snapshot, options, selected = self.snapshot, self.options, self._selected()
-        if options.mode == Mode.AUTO and sign_codes_pay_off(selected, options.k):
-            coded = snapshot.has_sign_codes
-            scored = self._search_by_sign_codes() if coded else self._search_on_gpu()
-            if scored is not None:
-                return scored
-        rows, scores = scan_top_k(snapshot.chunks, self.vector, options.k, self.row_mask)
+        snapshot, options, selected = self.snapshot, self.options, self.selected
+        if (
+            options.mode == Mode.AUTO
+            and snapshot.has_sign_codes
+            and sign_codes_pay_off(selected, options.k)
+            and (scored := self._search_by_sign_codes()) is not None
+        ):
+            return scored
+        rows, scores = scan_top_k(snapshot, self.vector, options.k, self.row_mask)
         return _ScoredRows(rows, scores, EXHAUSTIVE, selected)
 
-    def mask_min_score(self) -> NDArray[np.bool_]:
-        """Return the rows of the mask that score at least `options.min_score`."""
-        min_score, number = self.options.min_score, len(self.row_mask)
-        assert min_score is not None
-        scored = None
-        if (
-            self.options.mode == Mode.AUTO
-            and self.snapshot.has_sign_codes
-            and sign_codes_pay_off(number, 1)
-        ):
-            all_rows = replace(self, options=SearchOptions(number, min_score))
-            scored = all_rows._search_by_sign_codes()
-        if scored is not None:
-            rows, scores = scored.rows, scored.scores
-        else:
-            rows, scores = scan_min_score(
-                self.snapshot.chunks, self.vector, min_score, self.row_mask
-            )
-        passing = np.zeros(number, bool)
-        passing[rows[_round_scores(scores) >= min_score]] = True
-        return passing
-
-    def rank_photos(self, scored: _ScoredRows) -> list[tuple[UUID, int, float]]:
-        """Return (photo, row, score), sorted by descending score, ties by photo id."""
+    def rank_photos(self, scored: _ScoredRows) -> list[SearchHit]:
+        """Return the hits, sorted by descending score, ties by photo id."""
         options, rows, scores = self.options, scored.rows, _round_scores(scored.scores)
         if options.min_score is not None:
             passing = scores >= options.min_score
@@ -167,14 +124,14 @@ class _Query:
             kth = np.partition(scores, len(scores) - options.k)[len(scores) - options.k]
             best = scores >= kth
             rows, scores = rows[best], scores[best]
-        ranked: list[tuple[float, UUID, int]] = sorted(
-            (-score, photo_id, row)
-            for score, photo_id, row in zip(
-                scores.tolist(), self.snapshot.photos.ids(rows), rows.tolist(), strict=True
-            )
+        ranked: list[tuple[float, UUID]] = sorted(
+            (-score, photo_id)
+            for score, photo_id in zip(scores.tolist(), self.snapshot.photos.ids(rows), strict=True)
             if photo_id is not None
         )
-        return [(photo_id, row, -score) for score, photo_id, row in ranked[: options.k]]
+        return [
+            SearchHit(photo_id=photo_id, score=-score) for score, photo_id in ranked[: options.k]
+        ]
 
     def to_response(self, hits: list[SearchHit], scored: _ScoredRows) -> SearchResponse:
         """Build the response; missing chunks may contain better rows."""
@@ -188,17 +145,6 @@ class _Query:
             snapshot_version=self.snapshot.version,
             missing=missing,
         )
-
-    def _search_on_gpu(self) -> _ScoredRows | None:
-        """Search on the GPU; None if the snapshot is not loaded there, or the GPU fails."""
-        snapshot, k, min_score = self.snapshot, self.options.k, self.options.min_score
-        if snapshot.gpu is None:
-            return None
-        rows = snapshot.gpu.find_candidates(snapshot, self.vector, self.row_mask, k, min_score)
-        if rows is None:
-            return None
-        scores = exact_scores(snapshot.chunks, self.vector, rows)
-        return _ScoredRows(rows, scores, EXHAUSTIVE, self._selected())
 
     def _search_by_sign_codes(self) -> _ScoredRows | None:
         """Search by sign codes; None if an error of an estimate is larger than chance explains."""
@@ -217,10 +163,12 @@ class _Query:
             return None
         return _ScoredRows(result.rows, result.scores, STATISTICAL, result.scanned, result.max_z)
 
-    def _selected(self) -> int:
+    @cached_property
+    def selected(self) -> int:
+        """Number of rows that may be returned."""
         return int(np.count_nonzero(self.row_mask))
 
 
 def _round_scores(scores: Scores) -> Scores:
     # Clipped, because a computed cosine may exceed 1 slightly.
-    return np.clip(np.round(scores, SCORE_DECIMALS), -1.0, 1.0)
+    return scores.round(SCORE_DECIMALS).clip(-1.0, 1.0)

@@ -1,4 +1,4 @@
-"""Compiled kernels of the search: Hamming distances and exact products.
+"""Compiled kernels of the search: Hamming distances and products of rows.
 
 Rows lie in many arrays, some of them memory-mapped files, so the kernels take addresses; the caller
 keeps the memory alive. The kernels release the GIL.
@@ -194,17 +194,17 @@ def weighted_bit_sums(
 
 
 @numba_jit(REORDERED_FASTMATH)
-def exact_products(
+def row_products(
     block_addresses: Addresses,
     first_rows: NDArray[np.int64],
     number_bytes: NDArray[np.int64],
     rows: NDArray[np.int64],
     query: NDArray[np.float32],
-    out: NDArray[np.float64],
+    out: NDArray[np.float32] | NDArray[np.float64],
 ) -> None:
-    """Dot products of float32 or float16 rows with the query, summed in float64.
+    """Dot products of float32 or float16 rows with the query, summed in the type of `out`.
 
-    Each product is exact in float64, and the sums of equal rows are equal.
+    Each product is exact in float64. The sums of equal rows are equal.
 
     Args:
         block_addresses: (c,) addresses of the blocks' rows.
@@ -212,21 +212,22 @@ def exact_products(
         number_bytes: (c,) bytes of a number of each block's rows: 4 for float32, 2 for float16.
         rows: (n,) row numbers.
         query: (dimension,) float32.
-        out: (n,) float64.
+        out: (n,) float32 or float64.
     """
+    number = out.dtype.type
     for index in range(rows.shape[0]):
         block = np.searchsorted(first_rows, rows[index], side="right") - 1
         row_bytes = number_bytes[block] * query.shape[0]
         address = block_addresses[block] + np.uint64((rows[index] - first_rows[block]) * row_bytes)
-        total = 0.0
+        total = number(0)
         if number_bytes[block] == 2:
             halves = nb.carray(_float16_bits_at(address), query.shape)
             for i in range(query.shape[0]):
-                total += np.float64(_float16_value(halves[i])) * np.float64(query[i])
+                total += number(_float16_value(halves[i])) * number(query[i])
         else:
             row = nb.carray(_floats_at(address), query.shape)
             for i in range(query.shape[0]):
-                total += np.float64(row[i]) * np.float64(query[i])
+                total += number(row[i]) * number(query[i])
         out[index] = total
 
 

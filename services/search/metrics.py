@@ -6,7 +6,7 @@ import contextlib
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
-from typing import Any
+from uuid import UUID
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
@@ -165,41 +165,24 @@ class _SnapshotCollector(Collector):
         yield CounterMetricFamily(
             f"{METRIC_PREFIX}_code_scan_queries", queries, batcher.queries_run
         )
-        devices, lags = status.devices, status.lags.items()
-        labelled: tuple[tuple[str, str, str, Mapping[Any, float]], ...] = (
+        lags = status.lags.items()
+        of_generations: tuple[tuple[str, str, Mapping[UUID, float]], ...] = (
+            ("version", "Version of the map in the snapshot.", status.versions),
             (
-                "device_resident_bytes",
-                "Bytes of descriptors in a GPU's memory.",
-                "device",
-                {device.name: device.resident_bytes for device in devices},
-            ),
-            (
-                "device_failed",
-                "1 while the CPU searches because the GPU has failed.",
-                "device",
-                {device.name: device.failure is not None for device in devices},
-            ),
-            (
-                "snapshot_version",
-                "Version of the map in the snapshot.",
-                "generation",
-                status.versions,
-            ),
-            (
-                "snapshot_lag_versions",
+                "lag_versions",
                 "Versions behind the map.",
-                "generation",
                 {key: lag.versions for key, lag in lags},
             ),
             (
-                "snapshot_lag_seconds",
+                "lag_seconds",
                 "Seconds since the snapshot was last known to be current.",
-                "generation",
                 {key: lag.seconds for key, lag in lags},
             ),
         )
-        for name, text, label, values in labelled:
-            family = GaugeMetricFamily(f"{METRIC_PREFIX}_{name}", text, labels=[label])
+        for name, text, values in of_generations:
+            family = GaugeMetricFamily(
+                f"{METRIC_PREFIX}_snapshot_{name}", text, labels=["generation"]
+            )
             for key, amount in values.items():
                 family.add_metric([str(key)], float(amount))
             yield family

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterable
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from operator import attrgetter
 from typing import Any
+from uuid import UUID
 
 import numpy as np
 from cachetools import LRUCache, cachedmethod
 
 from services.search.photo_matcher import PhotoMatcher, match_threads, unusable_query_reason
 from shared.errors import NotFound
-from shared.geometry.cameras import Camera, CameraSource
+from shared.geometry.cameras import Camera, CameraSource, hash_camera_key
 from shared.geometry.component import Component, quaternion_of
 from shared.geometry.frames import EastNorthUp, Similarity
 from shared.geometry.localise import LocalPose, NoPose, localise
@@ -87,7 +88,7 @@ class PoseEstimator:
                 query[1],
                 candidates,
                 list(components.values()),
-                *_camera(request, query[1], components.values()),
+                *_camera(request, query[1], list(components.values())),
                 MutualNearest.of_model(request.features_model),
                 frozenset(request.leave_out),
             )
@@ -120,33 +121,59 @@ def _size_bytes(component: Component) -> int:
 
 
 def _camera(
-    request: PoseRequest, query: LocalFeatures, components: Iterable[Component]
+    request: PoseRequest, query: LocalFeatures, components: Sequence[Component]
 ) -> tuple[Camera | None, CameraSource]:
     """Return the camera of the query, if it is known, and where it comes from.
 
-    That of a photo of the reconstruction was refined together with it: of the query itself, if it
-    is one, or of a photo of the same shape and with the same focal length in its EXIF.
+    Cameras of the reconstruction were refined together with it: that of the query itself, if it is
+    one of its photos; that with the query's `camera_key`, if it was imported; or that of a photo of
+    the same shape and with the same focal length in its EXIF. An imported one has a principal point
+    and distortion, too, which a focal length that is given leaves as they are.
     """
-    width, height = query.width, query.height
-    same = set(request.leave_out)
-    if request.camera_source == CameraSource.EXIF and request.focal_length is not None:
-        same |= {
-            one.photo_id
-            for one in request.candidates
-            if one.focal_length and abs(one.focal_length / request.focal_length - 1) < SAME_FOCAL
-        }
-    if request.camera_source != CameraSource.GIVEN:
-        for component in components:
-            for row, photo_id in enumerate(component.photo_ids):
-                camera = component.cameras[component.camera_numbers[row]]
-                if photo_id in same and abs(camera.width * height / camera.height / width - 1) < (
-                    SAME_SHAPE
-                ):
-                    return camera.resized(width, height), CameraSource.MAP
-    if request.focal_length is not None:
-        camera = Camera.of_focal_length(width, height, request.focal_length)
-        return camera, CameraSource(request.camera_source)
-    return None, CameraSource.ESTIMATED
+    size = query.width, query.height
+    known = _find_camera(request, size, components)
+    if request.focal_length is not None and request.camera_source == CameraSource.GIVEN:
+        if known is None or known.rays is None:
+            known = Camera.of_focal_length(*size, request.focal_length)
+        return known.resized(*size).with_focal_length(request.focal_length), CameraSource.GIVEN
+    if known is not None:
+        return known.resized(*size), CameraSource.MAP
+    if request.focal_length is None:
+        return None, CameraSource.ESTIMATED
+    camera = Camera.of_focal_length(*size, request.focal_length)
+    return camera, CameraSource(request.camera_source)
+
+
+def _find_camera(
+    request: PoseRequest, size: tuple[int, int], components: Sequence[Component]
+) -> Camera | None:
+    """Return the camera of the reconstruction that took the query, as far as photos tell it."""
+    cameras: dict[UUID, Camera] = {
+        photo_id: component.cameras[number]
+        for component in components
+        for photo_id, number in zip(
+            component.photo_ids, component.camera_numbers.tolist(), strict=True
+        )
+    }
+    if own := next((cameras[id_] for id_ in request.leave_out if id_ in cameras), None):
+        return own
+    if request.camera_key is not None:
+        key = hash_camera_key(request.camera_key)
+        imported = next(filter(None, (each.find_camera(key) for each in components)), None)
+        if imported is not None and imported.rays is not None:
+            return replace(imported, rays=imported.rays.turned(request.quarter_turns))
+    if request.focal_length is None:
+        return None
+    for candidate in request.candidates:
+        camera = cameras.get(candidate.photo_id)
+        # Other imported cameras have distortions of their own.
+        if camera is None or camera.rays is not None or candidate.focal_length is None:
+            continue
+        shape = camera.width * size[1] / camera.height / size[0]
+        zoom = candidate.focal_length / request.focal_length
+        if abs(shape - 1) < SAME_SHAPE and abs(zoom - 1) < SAME_FOCAL:
+            return camera
+    return None
 
 
 def _to_message(pose: LocalPose, number: int, component: PoseComponent) -> ComponentPose:

@@ -16,7 +16,7 @@ from services.search.photo_columns import JoinedColumns
 from shared.search_api.protocol import IndexPart, LoadedGeneration
 
 if TYPE_CHECKING:  # imports numba, which takes a while to load; small maps need no codes
-    from services.search.gpu import GpuRows
+    from services.search.exact_rerank import RowBlocks
     from services.search.sign_code_search import SignCodeBlocks
 
 
@@ -32,10 +32,10 @@ class Snapshot:
     version: int
     chunks: tuple[LoadedChunk, ...]
     missing: tuple[str, ...] = ()
+    disk_full: bool = False
+    """Whether some are missing only because the disk of the worker's cache is full."""
     parts: tuple[IndexPart, ...] = ()
     """Parts of the index, and whether they are resident or mapped files."""
-    gpu: GpuRows | None = None
-    """A GPU that may have loaded the rows; None if there is none."""
 
     @cached_property
     def by_key(self) -> Mapping[str, LoadedChunk]:
@@ -71,6 +71,13 @@ class Snapshot:
         """Advise the system that these rows are read next, where they are mapped files."""
         for chunk, row in self.photos.locate(rows):
             self.chunks[chunk].prefetch_row(row)
+
+    @cached_property
+    def row_blocks(self) -> RowBlocks:
+        """Addresses of the rows, for compiled loops."""
+        from services.search.exact_rerank import RowBlocks
+
+        return RowBlocks.of(self.chunks)
 
     @cached_property
     def sign_code_blocks(self) -> SignCodeBlocks:

@@ -12,8 +12,7 @@ import logging
 import threading
 import time
 from collections.abc import Collection, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from concurrent import futures
 from uuid import UUID
 
 import numpy as np
@@ -32,14 +31,14 @@ from services.search.photo_columns import build_row_mask
 from services.search.photo_matcher import PhotoMatcher
 from services.search.pose_estimator import PoseEstimator
 from services.search.query_batcher import QueryBatcher
-from services.search.residency import MemoryBudget, open_search_gpu
+from services.search.residency import MemoryBudget
 from services.search.snapshot import Snapshot
 from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.session import Catalog, ChangePoll
 from shared.catalog.generations import GenerationState
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD, Shard
-from shared.errors import Gone, InvalidRequest, NotFound, Unavailable
+from shared.errors import Gone, NotFound, Unavailable
 from shared.search_api.background import subtract_background
 from shared.search_api.protocol import (
     MatchRequest,
@@ -55,11 +54,6 @@ from shared.storage import ObjectStore
 from shared.storage.chunks import Row, read_row, rows_are_valid
 from shared.storage.keys import QUERIES
 from shared.storage.read_retries import ReadRetries
-from shared.word_weights.weights import apply_word_weights
-
-if TYPE_CHECKING:
-    from services.search.gpu import GpuRows
-
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +78,7 @@ class QueryRowReader:
             Unavailable: `chunk_unreadable` if the row's object is damaged.
         """
         chunk = snapshot.by_key.get(request.object_key)
-        if request.object_key in snapshot.missing:
+        if request.object_key in snapshot.missing and not snapshot.disk_full:
             raise _unreadable_error(request.object_key)
         if chunk is None:
             reference = RowReference(object_key=request.object_key, row=request.row)
@@ -157,16 +151,16 @@ def _unreadable_error(object_key: str) -> Unavailable:
 MAX_WAIT_SECONDS = 5.0  # for `min_version`; half of the time that the gateway gives a shard
 FOLLOW_SECONDS = 1.0  # interval of the polls for changes of the catalog
 VERSION_POLL_SECONDS = 0.01
-MAX_SYNC_COPY_BYTES = 1 << 28  # to a GPU, before a new snapshot is served: a tenth of a second
+LOAD_THREADS = 4  # one may take minutes for a generation that is being built
 FILE_CHECK_SECONDS = 5.0  # interval of the checks whether mapped files were changed
 
 
 class SearchWorker:
     """Holds one snapshot of its shard for each generation; `search` is thread-safe.
 
-    A query never waits for a lock held by a loading thread: it uses the current snapshot, and only
-    if that is older than `min_version` does it sync the generation, or wait for the thread that
-    does. Loading one generation never blocks syncing or searching another.
+    A query uses the current snapshot. Only if that is older than `min_version` does it wait, at
+    most `max_wait_seconds`, for the thread that loads the newer one. Loading one generation never
+    blocks syncing or searching another.
     """
 
     def __init__(
@@ -176,10 +170,9 @@ class SearchWorker:
         settings: Settings,
         shard: Shard = SINGLE_SHARD,
         *,
-        gpu: GpuRows | None = None,
         max_wait_seconds: float = MAX_WAIT_SECONDS,
     ) -> None:
-        """Create a worker without any snapshot; its GPU is by default as SEARCH_DEVICE says."""
+        """Create a worker without any snapshot."""
         self.shard = shard
         self.replication_lag = ReplicationLagTracker()
         self._catalog = catalog
@@ -192,9 +185,9 @@ class SearchWorker:
         self._photo_matcher = PhotoMatcher(store)
         self._pose_estimator = PoseEstimator(store, self._photo_matcher)
         self._snapshots: dict[UUID, Snapshot] = {}
-        self._snapshots_lock = threading.Lock()  # never held during I/O
-        self._load_locks: dict[UUID, threading.Lock] = {}
-        self._gpu = gpu or open_search_gpu(settings.search_device)
+        self._lock = threading.Lock()  # of snapshots and loads; never held during I/O
+        self._loads: dict[UUID, futures.Future[Snapshot | None]] = {}  # running, of each generation
+        self._load_threads = futures.ThreadPoolExecutor(LOAD_THREADS, "search-load")
         self._unreadable = ReadRetries()
         self._files_due: dict[UUID, float] = {}  # next check of each generation's files
 
@@ -235,27 +228,21 @@ class SearchWorker:
             if target.state not in states:
                 continue
             snapshot = self._snapshots.get(generation_id)
-            if snapshot is None or snapshot.version < target.version:
-                self._sync_generation(generation_id, target.version)
-            elif self._needs_reload(snapshot):
-                self._sync_generation(generation_id, target.version, damaged=snapshot)
-            if self._gpu is not None and (new := self._snapshots.get(generation_id)):
-                self._gpu.load(new)
+            if (
+                snapshot is None
+                or snapshot.version < target.version
+                or self._needs_reload(snapshot)
+            ):
+                self._load(generation_id, target.version)
             self.replication_lag.record_synced(generation_id, read_at)
         ended = held - current.keys()
         for generation_id in ended:
             self._memory_budget.release_generation(generation_id)
-        if self._gpu is not None:
-            self._gpu.release(ended)
-        with self._snapshots_lock:
+        with self._lock:
             self._snapshots = {k: v for k, v in self._snapshots.items() if k not in ended}
-            known = {*current, *self._snapshots}
-            self._load_locks = {
-                k: v for k, v in self._load_locks.items() if k in known or v.locked()
-            }
+            known = {*current, *self._snapshots, *self._loads}
             self._files_due = {k: v for k, v in self._files_due.items() if k in known}
-            loading = self._load_locks.keys()
-        remove_stale_folders(folders, known | loading)
+        remove_stale_folders(folders, known)
         self._unreadable.forget_others(
             {key for snapshot in self._snapshots.values() for key in snapshot.missing}
         )
@@ -269,8 +256,7 @@ class SearchWorker:
             query = subtract_background(query, background)
         row_mask = build_row_mask(snapshot.photos, request.photos, request.exclude)
         options = SearchOptions(request.k, request.min_score, request.mode)
-        weighted = _weight_query(query, request.word_weights)
-        return execute_query(snapshot, query, row_mask, options, self.query_batcher, weighted)
+        return execute_query(snapshot, query, row_mask, options, self.query_batcher)
 
     def match(self, request: MatchRequest) -> MatchResponse:
         """Match local features, of photos of any shard; see `MatchRequest`."""
@@ -294,8 +280,8 @@ class SearchWorker:
             versions=versions,
             incomplete=tuple(key for key, snapshot in snapshots.items() if snapshot.missing),
             missing=tuple(key for snapshot in snapshots.values() for key in snapshot.missing),
+            disk_full=any(snapshot.disk_full for snapshot in snapshots.values()),
             lags=self.replication_lag.current_lags(versions),
-            devices=() if self._gpu is None else (self._gpu.status(),),
         )
 
     def snapshot(self, generation_id: UUID, min_version: int) -> Snapshot:
@@ -305,51 +291,58 @@ class SearchWorker:
             Gone: `query_expired` if the generation no longer exists.
             Unavailable: `search_behind` if the version is not reached within `max_wait_seconds`.
         """
-        deadline = time.monotonic() + self._max_wait_seconds
-        while True:
-            snapshot = self._snapshots.get(generation_id)
-            if snapshot is not None and snapshot.version >= min_version:
-                return snapshot
-            snapshot = self._sync_generation(generation_id, min_version)
-            if snapshot is None:
-                raise _reference_expired_error(f"generation {generation_id}")
-            if snapshot.version >= min_version:
-                return snapshot
-            if time.monotonic() > deadline:
-                raise Unavailable(
-                    "search_behind",
-                    f"Search has not caught up with version {min_version} of the map. "
-                    "Retry in a moment.",
-                )
-            time.sleep(VERSION_POLL_SECONDS)
+        snapshot = self._snapshots.get(generation_id)
+        if snapshot is None or snapshot.version < min_version:
+            snapshot = self._load(generation_id, min_version, self._max_wait_seconds)
+        if snapshot is None:
+            raise _reference_expired_error(f"generation {generation_id}")
+        return snapshot
 
-    def _sync_generation(
-        self, generation_id: UUID, version: int, damaged: Snapshot | None = None
+    def _load(
+        self, generation_id: UUID, version: int, max_wait_seconds: float = threading.TIMEOUT_MAX
     ) -> Snapshot | None:
-        """Return a snapshot of this version or a later one that is not `damaged`."""
-        with self._snapshots_lock:
-            load_lock = self._load_locks.setdefault(generation_id, threading.Lock())
-        with load_lock:
-            old = self._snapshots.get(generation_id)
-            if old is not None and old.version >= version and old is not damaged:
-                return old  # another thread loaded it while this one waited
+        """Wait for a thread to load this version of a generation, or a later one.
+
+        All who wait for a generation wait for the same thread. Returns None if the generation no
+        longer exists; raises Unavailable (`search_behind`) when the time is over.
+        """
+        ends_at = time.monotonic() + max_wait_seconds
+        while (seconds := ends_at - time.monotonic()) > 0:
+            with self._lock:
+                load = self._loads.get(generation_id)
+                if load is None:
+                    load = self._load_threads.submit(self._load_snapshot, generation_id)
+                    self._loads[generation_id] = load
+            if futures.wait([load], seconds).done:
+                snapshot = load.result()
+                if snapshot is None or snapshot.version >= version:
+                    return snapshot
+                time.sleep(VERSION_POLL_SECONDS)
+        raise Unavailable(
+            "search_behind",
+            f"Search has not caught up with version {version} of the map. Retry in a moment.",
+        )
+
+    def _load_snapshot(self, generation_id: UUID) -> Snapshot | None:
+        """Load a generation in a thread of its own, and serve the new snapshot."""
+        new = None
+        try:
             new = sync_snapshot(
                 self._catalog,
                 self._store,
                 self._folder,
                 self._memory_budget,
                 generation_id,
-                old,
+                self._snapshots.get(generation_id),
                 self._unreadable,
                 self.shard,
             )
-            if new is not None:
-                if self._gpu is not None:
-                    self._gpu.load(new, MAX_SYNC_COPY_BYTES)
-                    new = replace(new, gpu=self._gpu)
-                with self._snapshots_lock:
-                    self._snapshots = {**self._snapshots, generation_id: new}
             return new
+        finally:
+            with self._lock:
+                if new is not None:
+                    self._snapshots = {**self._snapshots, generation_id: new}
+                del self._loads[generation_id]
 
     def _needs_reload(self, snapshot: Snapshot) -> bool:
         """Whether a missing chunk is due for a retry, or a mapped file was changed."""
@@ -360,15 +353,3 @@ class SearchWorker:
             return False
         self._files_due[snapshot.generation_id] = now + FILE_CHECK_SECONDS
         return any(chunk.was_changed() for chunk in snapshot.chunks)
-
-
-def _weight_query(row: Row, weights: tuple[float, ...]) -> Row | None:
-    """Return the weighted query; None without weights, or if no word of the query has a weight."""
-    if not weights:
-        return None
-    try:
-        weighted = apply_word_weights(row, weights)
-    except ValueError as error:
-        raise InvalidRequest("word_weights_mismatch", f"{error}.") from None
-    # float32 like all rows, so that every search strategy uses the same query.
-    return None if weighted is None else weighted.astype(np.float32)

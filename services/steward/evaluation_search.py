@@ -137,12 +137,13 @@ def read_geotagged_photos(
 
 
 MAX_READ_ATTEMPTS = 2
+WITH_PLACE = PhotoFilter(has_place=True)
 
 UNKNOWN_LOCATION = PhotoLocation(None, None, None)
 
 LocatedRanking = list[tuple[SearchHit, PhotoLocation]]
 RankPhoto = Callable[[GeotaggedPhoto, int], LocatedRanking | None]
-"""`EvaluationSearch.rank_similar` with its weights bound."""
+"""The type of `EvaluationSearch.rank_similar`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,12 +194,11 @@ class EvaluationSearch:
         self,
         query: GeotaggedPhoto,
         k: int,
-        weights: tuple[float, ...] = (),
-        excluded_photos: tuple[UUID, ...] = (),
+        photos: PhotoFilter = WITH_PLACE,
     ) -> LocatedRanking | None:
         """Return the k most similar geotagged database photos with their locations.
 
-        The query photo is excluded, too. Without word weights, the ranking is unweighted.
+        The query photo is excluded, too.
 
         Returns:
             The ranking, best first; None if the query was deleted since.
@@ -219,9 +219,8 @@ class EvaluationSearch:
                 row=descriptor.row,
                 min_version=self.version,
                 k=k,
-                photos=PhotoFilter(has_place=True),
-                exclude=(query.photo_id, *excluded_photos),
-                word_weights=weights,
+                photos=photos,
+                exclude=(query.photo_id,),
             )
             try:
                 answer = self.search.search(request)

@@ -5,9 +5,6 @@ and after it are easy matches, so the recall is optimistic; it is measured a sec
 photos of its sequence. Use both to compare two generations of a map. *Labelled queries* (photos of
 role `query`) were taken at another time: their recall is what users see.
 
-Word weights change the ranking: a place model is valid only for rankings by the weights that it
-was fitted with.
-
 Where the photos have local features, a second place model is fitted on some of the photos with
 their matches. It is used if it answers more at the same share of right answers (`_helps`).
 """
@@ -28,7 +25,6 @@ from services.steward.evaluation_search import (
     EvaluationSearch,
     GeotaggedPhoto,
     GeotaggedPhotos,
-    RankPhoto,
     read_geotagged_photos,
 )
 from shared.catalog.chunks import find_features_model
@@ -36,6 +32,7 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map, Matching
 from shared.catalog.photos import PhotoRole
+from shared.catalog.vocabularies import vocabulary_standing
 from shared.evaluation.places.evidence import (
     EVIDENCE_DEPTH,
     MATCHED_PHOTOS,
@@ -46,15 +43,16 @@ from shared.evaluation.places.evidence import (
     is_same_place,
 )
 from shared.evaluation.places.figures import PlaceEvaluation, evaluate_places
-from shared.evaluation.places.fit import MIN_OWN_PHOTOS, PlaceSample
+from shared.evaluation.places.fit import MIN_OWN_PHOTOS, MapScores, PlaceSample
 from shared.evaluation.places.levels import LevelScheme, candidate_levels
-from shared.evaluation.places.probability import PlaceModel
+from shared.evaluation.places.probability import Background, MapExtent, PlaceModel
 from shared.evaluation.places.samples import (
     SAME_SESSION_PERIOD,
     IndexRanking,
     OwnPhotoSampler,
     attach_matches,
 )
+from shared.search_api.photo_filter import PhotoFilter
 from shared.search_api.protocol import SearchBackend, SearchHit
 
 Photo = TypeVar("Photo")
@@ -161,6 +159,8 @@ MAX_MATCHED_SAMPLE = 500  # photos whose matches are computed: about a minute on
 MIN_PHOTOS_TO_DECIDE = 100  # with fewer, it stays open whether matches help
 MIN_ANSWERED_GAIN = 0.03  # of the share of answered queries
 DECISIVE_CERTAINTY = 0.95
+BACKGROUND_PHOTOS = 200  # whose scores with BACKGROUND_QUERIES others are those of random pairs
+BACKGROUND_QUERIES = 30
 MAX_RANKS = 800  # depth of the search for other places where hundreds of photos show the same one
 
 
@@ -232,7 +232,10 @@ class MapEvaluation:
             self.queries = _draw(queries, max_photos or len(queries), seed=0)
             version = session.get_one(Map, generation.map_id).version
             has_features = find_features_model(session, generation.id) is not None
+            has_own_vocabulary = vocabulary_standing(session, generation) == "own"
         self.matching = matching if has_features else Matching.OFF
+        is_known = has_own_vocabulary and "pca" not in generation.spec
+        self._extractor = generation.extractor if is_known else ""
         self._by_id = {photo.photo_id: photo for photo in self.database.photos}
         self._index_of = {photo.photo_id: i for i, photo in enumerate(self.database.photos)}
         self.search = EvaluationSearch(catalog, search, generation, version, self._by_id)
@@ -241,32 +244,35 @@ class MapEvaluation:
         """Draw at most `size` database photos as leave-one-out queries, reproducible by `seed`."""
         return _draw(self.database.photos, size, seed)
 
-    def evaluate(
-        self, sample: Sequence[GeotaggedPhoto], weights: tuple[float, ...] = ()
-    ) -> MapEvaluationResult:
+    def evaluate(self, sample: Sequence[GeotaggedPhoto]) -> MapEvaluationResult:
         """Search with every photo of the sample and every labelled query, and compute the metrics.
 
-        The sample is that of the leave-one-out evaluation. Without weights, it is unweighted.
+        The sample is that of the leave-one-out evaluation.
         """
-        rank_photo = partial(self.search.rank_similar, weights=weights)
         own_photos = OwnPhotoSampler(
             [photo.spot for photo in self.database.photos],
             [photo.captured_at for photo in self.database.photos],
             self.scheme,
             self.radius_m,
-            partial(self._rank_own_photo, rank_photo),
+            self._rank_own_photo,
         )
         recalls = self._leave_one_out(sample, own_photos, lambda _, ranked: ranked)
         indices = [self._index_of[photo.photo_id] for photo in sample]
         spread = own_photos.spread(indices)
-        labelled = self._evaluate_labelled_queries(rank_photo, own_photos, spread)
+        labelled = self._evaluate_labelled_queries(own_photos, spread)
         samples = list(own_photos.samples(indices, spread))
         to_fit = [o for o in labelled.outcomes if not o.same_session]
+        scores = MapScores(
+            spread,
+            self._measure_background(sample),
+            MapExtent.of([photo.spot for photo in self.database.photos], self.scheme),
+            self._extractor,
+        )
         places = evaluate_places(
-            samples, [o.sample for o in to_fit if o.sample], self.scheme, spread
+            samples, [o.sample for o in to_fit if o.sample], self.scheme, scores
         )
         model = places.model
-        with_matches, uses_matches = self._evaluate_matches(own_photos, samples, to_fit, spread)
+        with_matches, uses_matches = self._evaluate_matches(own_photos, samples, to_fit, scores)
         if with_matches is not None:
             of_matches = self._leave_one_out(
                 self._draw_to_match(sample), own_photos, self._order_by_matches
@@ -293,7 +299,7 @@ class MapEvaluation:
         own_photos: OwnPhotoSampler,
         samples: Sequence[PlaceSample],
         labelled: Sequence[QueryOutcome],
-        spread: float,
+        scores: MapScores,
     ) -> tuple[PlaceEvaluation | None, bool | None]:
         """Fit a place model with matches, and one without on the same photos to compare it with.
 
@@ -306,18 +312,30 @@ class MapEvaluation:
         chosen = self._draw_to_match(sorted({sample.photo for sample in samples}))
         matched: list[PlaceSample] = []
         for photo in chosen:
-            matched += own_photos.samples([photo], spread, self._match_own_photo)
+            matched += own_photos.samples([photo], scores.spread, self._match_own_photo)
             self.on_query()
         photos = {sample.photo for sample in matched}
         if len(photos) < MIN_OWN_PHOTOS:
             return None, None
         plain = [sample for sample in samples if sample.photo in photos]
         both = [(o.sample, o.matched_sample) for o in labelled if o.sample and o.matched_sample]
-        without = evaluate_places(plain, [each for each, _ in both], self.scheme, spread)
-        places = evaluate_places(matched, [each for _, each in both], self.scheme, spread)
+        without = evaluate_places(plain, [each for each, _ in both], self.scheme, scores)
+        places = evaluate_places(matched, [each for _, each in both], self.scheme, scores)
         if self.matching == Matching.ON or _helps(without, places):
             return places, True
         return places, False if len(photos) >= MIN_PHOTOS_TO_DECIDE else None
+
+    def _measure_background(self, sample: Sequence[GeotaggedPhoto]) -> Background:
+        """Return mean and deviation of the scores of random pairs of photos."""
+        others = [
+            photo.photo_id for photo in _draw(self.database.photos, BACKGROUND_PHOTOS, seed=1)
+        ]
+        among = PhotoFilter(ids=tuple(others))
+        scores: list[float] = []
+        for photo in _draw(sample, BACKGROUND_QUERIES, seed=2):
+            ranking = self.search.rank_similar(photo, len(others), among) or []
+            scores += [hit.score for hit, _ in ranking]
+        return Background.of(scores)
 
     def _draw_to_match(self, photos: Sequence[Photo]) -> list[Photo]:
         """Draw those of a sample that are matched, always the same."""
@@ -371,21 +389,21 @@ class MapEvaluation:
             "leave_one_out_without_sequence": apart.figures(),
         }
 
-    def _rank_own_photo(self, rank_photo: RankPhoto, index: int) -> IndexRanking | None:
+    def _rank_own_photo(self, index: int) -> IndexRanking | None:
         """Rank the photos with a location by their similarity to one of them."""
-        ranking = rank_photo(self.database.photos[index], MAX_RANKS)
+        ranking = self.search.rank_similar(self.database.photos[index], MAX_RANKS)
         self.on_query()
         if ranking is None:
             return None
         indices = np.array([self._index_of[hit.photo_id] for hit, _ in ranking], dtype=np.int64)
-        return indices, np.array([hit.ranked_by for hit, _ in ranking], dtype=np.float64)
+        return indices, np.array([hit.score for hit, _ in ranking], dtype=np.float64)
 
     def _evaluate_labelled_queries(
-        self, rank_photo: RankPhoto, own_photos: OwnPhotoSampler, spread: float
+        self, own_photos: OwnPhotoSampler, spread: float
     ) -> _LabelledQueryMetrics:
         labelled = _LabelledQueryMetrics()
         for number, query in enumerate(self.queries):
-            ranking = rank_photo(query, EVIDENCE_DEPTH)
+            ranking = self.search.rank_similar(query, EVIDENCE_DEPTH)
             self.on_query()
             if ranking is None:
                 continue
@@ -395,7 +413,7 @@ class MapEvaluation:
                     [is_same_place(query.spot, spot, self.radius_m) for _, spot in ranking]
                 )
             ranked = [
-                RankedPhoto(hit.ranked_by, spot, self._index_of.get(hit.photo_id))
+                RankedPhoto(hit.score, spot, self._index_of.get(hit.photo_id))
                 for hit, spot in ranking
             ]
             best = self._index_of.get(ranking[0][0].photo_id) if ranking else None

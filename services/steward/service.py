@@ -10,7 +10,12 @@ import threading
 
 from prometheus_client import CollectorRegistry
 
-from services.service_process import Announce, service_process, start_service_threads
+from services.service_process import (
+    SIGNAL_POLL_SECONDS,
+    Announce,
+    service_process,
+    start_service_threads,
+)
 from services.steward.batches.worker import BatchWorker
 from services.steward.evaluation_worker import EvaluationWorker
 from services.steward.metrics import StewardMetrics
@@ -22,10 +27,6 @@ from shared.config.settings import Settings
 from shared.jobs.celery_wakeups import CeleryWakeups, create_celery_app
 from shared.search_api.client import HttpSearchClient
 from shared.telemetry.metrics_server import serve_metrics
-
-# Python runs a signal's handler when the main thread is awake. A signal that arrives just as the
-# thread blocks is handled when that ends.
-SIGNAL_POLL_SECONDS = 1.0
 
 
 def serve_steward(settings: Settings, announce: Announce) -> None:
@@ -40,16 +41,16 @@ def serve_steward(settings: Settings, announce: Announce) -> None:
         process_heartbeat(catalog, "steward"),
         contextlib.closing(CeleryWakeups(create_celery_app(settings), settings)) as wakeups,
         HttpSearchClient.from_settings(settings) as search,
+        serve_metrics(settings, registry := CollectorRegistry()),
     ):
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
         store = open_installation_store(catalog, settings, exclusive=False)
         name = f"steward-{socket.gethostname()}-{os.getpid()}"
-        registry = CollectorRegistry()
         metrics = StewardMetrics(registry)
         batches = BatchWorker(catalog, store, wakeups, settings, name, metrics)
         scheduler = Scheduler(catalog, store, wakeups, settings, metrics)
-        evaluator = EvaluationWorker(catalog, store, search, settings, name, metrics)
+        evaluator = EvaluationWorker(catalog, search, settings, name, metrics)
         webhooks = WebhookDispatcher(catalog, settings)
         threads = start_service_threads(
             {
@@ -61,8 +62,7 @@ def serve_steward(settings: Settings, announce: Announce) -> None:
             stop,
         )
         announce("Placewise steward is running")
-        with serve_metrics(settings, registry):
-            while not stop.wait(SIGNAL_POLL_SECONDS):
-                pass
-            for thread in threads:
-                thread.join()
+        while not stop.wait(SIGNAL_POLL_SECONDS):
+            pass
+        for thread in threads:
+            thread.join()

@@ -45,9 +45,8 @@ class RowType(StrEnum):
 class Generation(Journaled, Base):
     """A generation. `spec` has everything that determines a descriptor's value.
 
-    `calibration` is a `shared.evaluation.places.PlaceModel`, fitted by evaluations; `word_weights`
-    is a record of `shared.word_weights.record`. New chunks go into `open_slot`, which has
-    `open_slot_rows` rows so far.
+    `calibration` is a `shared.evaluation.places.PlaceModel`, fitted by evaluations. New
+    chunks go into `open_slot`, which has `open_slot_rows` rows so far.
     """
 
     __tablename__ = "generations"
@@ -69,7 +68,6 @@ class Generation(Journaled, Base):
     )
     whitening_id: Mapped[UUID | None] = mapped_column(Uuid, ForeignKey("whitenings.id"), index=True)
     calibration: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
-    word_weights: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
     uses_matches: Mapped[bool | None] = mapped_column(Boolean)
     """Whether local features improve its answers; null until an evaluation has decided it."""
     open_slot: Mapped[int] = mapped_column(Integer, default=0)

@@ -72,7 +72,6 @@ class JobKind(StrEnum):
     PCA = "pca"  # fit PCA whitening on the map's descriptors and switch to shorter ones
     ADD_MODEL = "add_model"  # check a checkpoint and register it as a model, for any map
     EVALUATE = "evaluate"  # search the map with photos whose place is known; compute recall
-    WORD_WEIGHTS = "word_weights"  # fit weights of the words of the map's vocabulary
     RECONSTRUCT = "reconstruct"  # reconstruct the map's photos (`shared.catalog.reconstructions`)
     BATCH = "batch"  # import many photos, each with its own job (`shared.catalog.batch_items`)
 
@@ -97,7 +96,7 @@ EXTRACTOR_JOBS = (
     JobKind.RECONSTRUCT,
     *MODEL_CHANGE_JOBS,
 )
-STEWARD_JOBS = (JobKind.EVALUATE, JobKind.WORD_WEIGHTS, JobKind.BATCH)
+STEWARD_JOBS = (JobKind.EVALUATE, JobKind.BATCH)
 
 # Run in slices: between two slices they are `running` without a lease.
 CHECKPOINTED_JOBS = (*MODEL_CHANGE_JOBS, JobKind.BATCH)

@@ -36,6 +36,8 @@ from shared.ids import new_id
 class Photo(Journaled, Base):
     """A live or deleted photo. `sha256` is unique among the live photos of a map.
 
+    So is `picture_sha256`, the hash of its path and of the file without metadata; null if unknown.
+
     `job_id` is the job that describes the photo; the photo is searchable if it has a row in
     `descriptors`. `altitude` is in metres, above the sea where its source says so; `focal_length`
     is a multiple of the longer side. `changed_version` is the map's version at the last change that
@@ -51,6 +53,7 @@ class Photo(Journaled, Base):
         sa.String(10), default=PhotoRole.DATABASE, server_default=PhotoRole.DATABASE
     )
     sha256: Mapped[str] = mapped_column(sa.String(64))
+    picture_sha256: Mapped[str | None] = mapped_column(sa.String(64))
     object_key: Mapped[str] = mapped_column(sa.Text)
     filename: Mapped[str] = mapped_column(sa.Text)
     relative_path: Mapped[str | None] = mapped_column(sa.Text)  # in its folder or archive
@@ -78,6 +81,13 @@ class Photo(Journaled, Base):
         ),
         partial_index(
             "uq_photos_live_sha256", "map_id", "sha256", only=deleted_at.is_(None), unique=True
+        ),
+        partial_index(
+            "uq_photos_live_picture",
+            "map_id",
+            "picture_sha256",
+            only=deleted_at.is_(None),
+            unique=True,
         ),
         sa.Index("ix_photos_map_uploaded", "map_id", "uploaded_at", "id"),
         sa.Index("ix_photos_map_changed", "map_id", "changed_version"),
@@ -178,13 +188,17 @@ def get_photo(session: Session, map_id: UUID, photo_id: UUID) -> Photo:
     return photo
 
 
-def find_photo_by_sha256(session: Session, map_id: UUID, sha256: str) -> Photo | None:
-    """Return the map's live photo with this hash, if any."""
-    return session.scalar(
-        sa.select(Photo).where(
-            Photo.map_id == map_id, Photo.sha256 == sha256, Photo.deleted_at.is_(None)
+def find_same_photo(
+    session: Session, map_id: UUID, sha256: str, picture_sha256: str | None
+) -> Photo | None:
+    """Return the live photo with these bytes, or else with this path and picture, if any."""
+    for same in (Photo.sha256 == sha256, Photo.picture_sha256 == picture_sha256):
+        photo = session.scalar(
+            sa.select(Photo).where(Photo.map_id == map_id, same, Photo.deleted_at.is_(None))
         )
-    )
+        if photo is not None or picture_sha256 is None:
+            return photo
+    return None
 
 
 def get_live_photos(session: Session, photo_ids: Iterable[UUID]) -> dict[UUID, Photo]:

@@ -15,6 +15,7 @@ import logging
 import os
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -43,6 +44,7 @@ from shared.ids import new_id
 log = logging.getLogger(__name__)
 
 PROCESS_HEARTBEAT_SECONDS = 10.0
+STATE_POLL_SECONDS = 0.5
 PROCESS_TIMEOUT_SECONDS = 35.0  # three missed heartbeats
 PROCESS_RETENTION_SECONDS = 86_400.0
 
@@ -82,23 +84,26 @@ def process_heartbeat(
 ) -> Iterator[None]:
     """Register this process while the block runs.
 
-    A thread writes a heartbeat with the state every PROCESS_HEARTBEAT_SECONDS; heartbeats are
-    skipped while the catalog is unreachable.
+    A thread writes a heartbeat with the state every PROCESS_HEARTBEAT_SECONDS, and soon after a
+    change of the state; heartbeats are skipped while the catalog is unreachable.
     """
     process_id, stop = new_id(), threading.Event()
     name = f"{socket.gethostname()}-{os.getpid()}"
     outage = OutageLog(f"{role}'s heartbeat")
 
     def send_heartbeats() -> None:
-        while True:
+        while not stop.is_set():
+            state = read_state()
             try:
                 with catalog.write(is_heartbeat=True) as session:
-                    _upsert_process(session, process_id, role, name, read_state())
+                    _upsert_process(session, process_id, role, name, state)
                 outage.record_success()
             except SQLAlchemyError as error:
                 outage.record_error(error)
-            if stop.wait(PROCESS_HEARTBEAT_SECONDS):
-                return
+            next_beat = time.monotonic() + PROCESS_HEARTBEAT_SECONDS
+            while time.monotonic() < next_beat and not stop.wait(STATE_POLL_SECONDS):
+                if read_state() != state:
+                    break
 
     thread = threading.Thread(target=send_heartbeats, name="heartbeat", daemon=True)
     thread.start()

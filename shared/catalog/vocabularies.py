@@ -23,7 +23,6 @@ from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import Map
 from shared.errors import Conflict, Misconfigured
 from shared.extractor_config.configs import (
-    ANYLOC_PREPROCESSING_NAMES,
     MIN_PHOTOS_TO_FIT,
     get_extractor_config,
 )
@@ -95,27 +94,6 @@ def next_fit_photos(session: Session, map_: Map) -> int | None:
     if not map_.auto_fit or not config.needs_vocabulary or is_reduced:
         return None
     return max(MIN_PHOTOS_TO_FIT, 2 * (map_.fitted_photos or 0))
-
-
-def word_weights_unavailable_reason(session: Session, generation: Generation) -> str | None:
-    """Return why the generation does not support word weights, as a clause; None if it does.
-
-    A weight applies to the block of the descriptor that belongs to a word, which is as long as a
-    local feature. PCA mixes the blocks; it is recognised by the shorter descriptors.
-    """
-    if generation.vocabulary_id is None:
-        return "its extractor uses no vocabulary"
-    preprocessing = generation.spec["preprocessing"]["name"]
-    if preprocessing in ANYLOC_PREPROCESSING_NAMES:
-        return f"with {preprocessing} its ranking has to be that of its authors' code"
-    if "beside" in generation.spec:
-        return "its rows are those of two extractors side by side"
-    vocabulary = session.get_one(Vocabulary, generation.vocabulary_id)
-    if "pca" in generation.spec or (
-        vocabulary.clusters * vocabulary.dimension != generation.dimension
-    ):
-        return "its descriptors are projected and no longer consist of a block per word"
-    return None
 
 
 def add_vocabulary(

@@ -225,8 +225,8 @@ class ExtractorSettings(BaseSettings):
             raise Misconfigured(
                 "code_not_allowed",
                 f"The TorchScript file of {name} holds code, which is not allowed here. If you "
-                f"trust where the file comes from, add {code} to CODE_ALLOWED of the extractors, "
-                "restart them, and try again.",
+                f"trust where the file comes from, add {code} to CODE_ALLOWED where it is to run, "
+                "restart the extractors, and try again.",
             )
 
     @property

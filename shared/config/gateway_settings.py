@@ -14,6 +14,7 @@ from shared.config.values import Size, split_list
 from shared.security.api_keys import Scope
 
 MIN_ADMIN_KEY_CHARACTERS = 16
+MAX_BATCH_PHOTOS = 1_000_000
 OPENSTREETMAP_TILES = "https://tile.openstreetmap.org/{z}/{x}/{y}.png"
 OPENSTREETMAP_ATTRIBUTION = "© OpenStreetMap contributors"
 
@@ -201,7 +202,7 @@ class GatewaySettings(BaseSettings):
     @property
     def max_batch_photos(self) -> int:
         """Photos of one batch, which become jobs of one map."""
-        return math.ceil(self.max_queued_jobs / 2)
+        return min(MAX_BATCH_PHOTOS, math.ceil(self.max_queued_jobs / 2))
 
     @property
     def tile_attribution(self) -> str | None:

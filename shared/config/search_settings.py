@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Literal
 
 from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings
@@ -32,9 +31,6 @@ class SearchSettings(BaseSettings):
         ge=0,
         description="bytes of codes and rows that search keeps in memory; unset: half of the "
         "machine's memory, or of the container's memory limit",
-    )
-    search_device: Literal["auto", "cpu", "cuda"] = Field(
-        "auto", description="device that compares rows; auto: a CUDA GPU where there is one"
     )
 
     # Search workers on several machines (`placewise search`, which listens on HOST and PORT).

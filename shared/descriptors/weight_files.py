@@ -17,6 +17,7 @@ import hashlib
 import pickle
 import re
 import time
+import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -236,6 +237,12 @@ def load_tensors(path: Path) -> Any:
     return torch.load(path, map_location="cpu", weights_only=True, mmap=is_archive)
 
 
+def is_safetensors(path: Path) -> bool:
+    """Whether a file has the format by its content: blobs in the hub's cache have no suffix."""
+    with path.open("rb") as file:
+        return file.read(9)[8:] == b"{"
+
+
 Shape = tuple[int, ...]
 
 
@@ -255,9 +262,7 @@ def open_tensor_file(path: Path) -> TensorFile:
     Raises:
         One of TENSOR_READ_ERRORS, also for a file without tensors.
     """
-    with path.open("rb") as file:
-        begin = file.read(9)
-    if begin[8:] == b"{":  # by content: blobs in a Hugging Face cache have no suffix
+    if is_safetensors(path):
         stored: Any = safe_open(path, framework="pt", device="cpu")  # untyped methods
         shapes = {name: tuple(stored.get_slice(name).get_shape()) for name in stored.keys()}  # noqa: SIM118
         return TensorFile(path, shapes, stored.get_tensor)
@@ -302,10 +307,20 @@ def check_declared_size(tensors: Iterable[torch.Tensor], path: Path) -> None:
 
 
 def _check_entries(path: Path) -> None:
-    # PyTorch's own reader: another one may find other entries in a hostile archive.
-    archive = torch._C.PyTorchFileReader(str(path))
-    declared = sum(archive.get_record_size(name) for name in archive.get_all_records())
-    size = path.stat().st_size
+    """Raise ValueError if the entries of an archive declare more bytes than it has."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+    except (zipfile.BadZipFile, NotImplementedError) as error:
+        raise ValueError(f"it is a damaged archive: {error}") from error
+    # PyTorch's own reader, which not all releases let tell sizes, may find others in a hostile one.
+    reader: Any = torch._C.PyTorchFileReader(str(path))
+    read = {name: reader.get_record_header_offset(name) for name in reader.get_all_records()}
+    if read != {each.filename.partition("/")[2]: each.header_offset for each in entries}:
+        raise ValueError(
+            "two readers find other entries in it. Save the file again with torch.save"
+        )
+    declared, size = sum(each.file_size for each in entries), path.stat().st_size
     if declared > size:
         raise ValueError(
             f"its entries declare {declared} bytes, and the file has {size}: they are compressed "

@@ -327,6 +327,10 @@ def _side_by_side_config(names: list[str], allow_test_extractors: bool) -> Extra
             "that they can't stand beside another extractor."
         )
     share = round(numbers[0] / sum(numbers), 3)
+    if not 0 < share < 1:
+        raise _bad_option_error(
+            f"{title}: each of the two needs a share of at least 0.001 of the weights."
+        )
     weights = (share, round(1 - share, 3))
     texts = [
         p.name + (f"@{w:g}" if share != 0.5 else "") for p, w in zip(parts, weights, strict=True)

@@ -1,9 +1,11 @@
-"""Cameras: the model of COLMAP's SIMPLE_RADIAL, and focal lengths from EXIF."""
+"""Cameras: the model of COLMAP's SIMPLE_RADIAL, rays of others, and focal lengths from EXIF."""
 
 from __future__ import annotations
 
+import hashlib
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
@@ -36,6 +38,83 @@ class CameraSource(StrEnum):
     """from the matches, together with the pose"""
 
 
+RAY_TERMS = 10
+"""Chebyshev polynomials along each side of a photo: a third of a pixel off at wide lenses' edges"""
+MAX_RAY_ANGLE = math.radians(75)
+"""Farther from the axis, a pixel's error is more than 15 times as large in a pinhole camera"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rays:
+    """Where the pixels of a camera of any model look, as polynomials of their positions.
+
+    The value (x, y) / |(x, y)| * angle at a pixel has the direction of its ray beside the axis,
+    and its angle from it.
+    """
+
+    coefficients: Floats
+    """(RAY_TERMS, RAY_TERMS, 2) of positions in [-1, 1] from left to right and top to bottom"""
+    focal_length: float
+    """of the camera, as a multiple of the longer side"""
+    camera_key: bytes
+    """(32,) of `hash_camera_key`; zero bytes if the photos do not say which camera it was"""
+    quarter_turns: int
+    """clockwise, by which the photo was turned upright"""
+
+    @classmethod
+    def fit(
+        cls,
+        look: Callable[[Floats], Floats],
+        size: tuple[int, int],
+        focal_length: float,
+        camera_key: bytes,
+        quarter_turns: int,
+    ) -> Rays:
+        """Fit the rays (m, 3) that `look` gives for (m, 2) pixels of a photo of width, height."""
+        nodes = np.polynomial.chebyshev.chebpts1(2 * RAY_TERMS)
+        places = np.stack(np.meshgrid(nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 2)
+        x, y, z = look((places + 1) / 2 * size).T
+        beside = np.hypot(x, y)
+        angles = np.arctan2(beside, z) / np.maximum(beside, 1e-12)
+        values = np.column_stack([x * angles, y * angles])
+        known = np.isfinite(values).all(axis=1)
+        across, down = places[known].T
+        degrees = (RAY_TERMS - 1, RAY_TERMS - 1)
+        terms = np.polynomial.chebyshev.chebvander2d(across, down, degrees)
+        found = np.linalg.lstsq(terms, values[known], rcond=None)[0]
+        shape = RAY_TERMS, RAY_TERMS, 2
+        return cls(found.reshape(shape), focal_length, camera_key, quarter_turns)
+
+    def turned(self, quarter_turns: int) -> Rays:
+        """Return the rays for photos that are turned clockwise by so much to be upright."""
+        coefficients = self.coefficients
+        for _ in range((quarter_turns - self.quarter_turns) % 4):
+            # The pixel at (x, y) was at (y, -x), and what was right of the axis is below it.
+            flipped = coefficients.swapaxes(0, 1) * (-1.0) ** np.arange(RAY_TERMS)[:, None, None]
+            coefficients = np.stack([-flipped[..., 1], flipped[..., 0]], axis=-1)
+        return replace(self, coefficients=coefficients, quarter_turns=quarter_turns)
+
+    def undistort(self, pixels: Floats, width: int, height: int) -> Floats:
+        """Return where a pinhole camera of this focal length would see what (m, 2) pixels see.
+
+        Its principal point is in the middle. NaN for what is more than MAX_RAY_ANGLE off its axis.
+        """
+        x, y = (2 * pixels / (width, height) - 1).T
+        values = np.polynomial.chebyshev.chebval2d(x, y, self.coefficients).T
+        angles = np.hypot(*values.T)
+        stretch = np.tan(angles) / np.maximum(angles, 1e-12)
+        stretch[angles > MAX_RAY_ANGLE] = np.nan
+        longer = max(width, height)
+        middle = np.array([width, height]) / 2
+        pinhole: Floats = middle + self.focal_length * longer * values * stretch[:, None]
+        return pinhole
+
+
+def hash_camera_key(camera_key: str) -> bytes:
+    """Return the 32 bytes that stand for a `PhotoHeader.camera_key`."""
+    return hashlib.sha256(camera_key.encode()).digest()
+
+
 @dataclass(frozen=True, slots=True)
 class Camera:
     """COLMAP's SIMPLE_RADIAL with the principal point in the middle of the photo.
@@ -44,13 +123,14 @@ class Camera:
 
         (width, height) / 2 + focal_pixels * (1 + radial * r^2) * (x, y) / z
 
-    where r^2 = (x^2 + y^2) / z^2.
+    where r^2 = (x^2 + y^2) / z^2. With `rays`, these are the pixels after `undistort`.
     """
 
     width: int
     height: int
     focal_pixels: float
     radial: float = 0.0
+    rays: Rays | None = field(default=None, compare=False)
 
     @classmethod
     def of_focal_length(cls, width: int, height: int, focal_length: float) -> Camera:
@@ -68,7 +148,12 @@ class Camera:
 
     def resized(self, width: int, height: int) -> Camera:
         """Return the camera of the same photo at another size."""
-        return Camera(width, height, self.focal_length * max(width, height), self.radial)
+        focal_pixels = self.focal_length * max(width, height)
+        return replace(self, width=width, height=height, focal_pixels=focal_pixels)
+
+    def undistort(self, pixels: Floats) -> Floats:
+        """Return the (m, 2) pixels where `project` has what the photo shows at (m, 2) pixels."""
+        return pixels if self.rays is None else self.rays.undistort(pixels, self.width, self.height)
 
     def project(self, points: Floats) -> Floats:
         """Project (m, 3) points in the camera's axes to (m, 2) pixels."""

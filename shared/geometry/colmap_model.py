@@ -12,21 +12,26 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from shared.errors import InvalidRequest
+from shared.http.request_model import FailFastList, RequestModel
 
 MAX_CAMERAS = 10_000
+MAX_PHOTOS = 50_000
 MAX_NAME_CHARACTERS = 1000
 MAX_FILE_BYTES = 2_000_000_000
 """Of `images.bin`, which also has the keypoints"""
-# Name and number of parameters, by the number of the model (src/colmap/sensor/models.h).
+# Name and number of parameters, by the number of the model (src/colmap/sensor/models.h). The next
+# one, EQUIRECTANGULAR, is not read: the points around a panorama serve no query.
 CAMERA_MODELS = dict(
     enumerate(
         [
             *(("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5)),
             *(("OPENCV", 8), ("OPENCV_FISHEYE", 8), ("FULL_OPENCV", 12), ("FOV", 5)),
             *(("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5), ("THIN_PRISM_FISHEYE", 12)),
+            *(("RAD_TAN_THIN_PRISM_FISHEYE", 16), ("SIMPLE_DIVISION", 4), ("DIVISION", 5)),
+            *(("SIMPLE_FISHEYE", 3), ("FISHEYE", 4), ("EUCM", 6)),
         ]
     )
 )
@@ -39,17 +44,19 @@ _POINT_BYTES = 24  # of an image: x, y, number of the point
 Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 
 
-class _Part(BaseModel):
+class _Part(RequestModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class ColmapCamera(_Part):
     """A camera of one of COLMAP's models; lengths in pixels."""
 
-    model: str = Field(description=f"one of {', '.join(PARAMETERS)}")
+    model: str = Field(
+        max_length=MAX_NAME_CHARACTERS, description=f"one of {', '.join(PARAMETERS)}"
+    )
     width: int = Field(ge=1, le=1_000_000)
     height: int = Field(ge=1, le=1_000_000)
-    params: list[Number] = Field(description="as COLMAP orders them", max_length=12)
+    params: list[Number] = Field(description="as COLMAP orders them", max_length=16)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -90,8 +97,8 @@ class ColmapPhoto(_Part):
 class ColmapModel(_Part):
     """Cameras and poses of a COLMAP model."""
 
-    cameras: list[ColmapCamera] = Field(min_length=1, max_length=MAX_CAMERAS)
-    photos: list[ColmapPhoto] = Field(min_length=3)
+    cameras: FailFastList[ColmapCamera] = Field(min_length=1, max_length=MAX_CAMERAS)
+    photos: FailFastList[ColmapPhoto] = Field(min_length=3, max_length=MAX_PHOTOS)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -128,10 +135,15 @@ def _join(numbers: list[float] | tuple[float, ...]) -> str:
 def read_colmap_model(folder: Path) -> ColmapModel:
     """Read cameras and poses of a COLMAP model, such as hloc's.
 
+    As COLMAP does, it reads the text files only if there are no binary ones. Files of COLMAP 3.12
+    and later have the poses of rigs and frames in `images`, too. pycolmap would end names at a
+    blank, and skip the last image of a text file without a line of points.
+
     Raises:
         InvalidRequest: `bad_colmap_model`, with what is wrong and where.
     """
-    suffix = next((s for s in (".bin", ".txt") if (folder / f"images{s}").is_file()), None)
+    files = [name + suffix for suffix in (".bin", ".txt") for name in ("images", "cameras")]
+    suffix = next((file[-4:] for file in files if (folder / file).is_file()), None)
     if suffix is None:
         inside = sorted(path.parent.name for path in folder.glob("*/images.*"))
         raise InvalidRequest(
@@ -161,6 +173,8 @@ def read_colmap_model(folder: Path) -> ColmapModel:
 
 
 def _read_limited(path: Path) -> bytes:
+    if not path.is_file():  # a FIFO would wait for a writer, and /dev/zero has no end
+        raise ValueError(f"{path.name} is missing, or no regular file")
     if path.stat().st_size > MAX_FILE_BYTES:
         raise ValueError(f"{path.name} has more than {MAX_FILE_BYTES} bytes")
     return path.read_bytes()
@@ -179,7 +193,8 @@ def _read_binary(
     for _ in range(min(_COUNT.unpack_from(camera_file)[0], MAX_CAMERAS)):
         camera_id, model, width, height = _CAMERA.unpack_from(camera_file, offset)
         if model not in CAMERA_MODELS:
-            raise ValueError(f"camera {camera_id} is of the unknown model {model}")
+            names = ", ".join(PARAMETERS)
+            raise ValueError(f"camera {camera_id} is of COLMAP's model {model}, not one of {names}")
         name, count = CAMERA_MODELS[model]
         params = struct.unpack_from(f"<{count}d", camera_file, offset + _CAMERA.size)
         numbers[camera_id] = len(cameras)
@@ -223,12 +238,19 @@ def _read_text(
                     params=list(map(float, params)),
                 )
             )
-    lines = [line for line in image_file.decode().splitlines() if not line.startswith("#")]
     photos: list[_Photo] = []
-    for line in lines[::2]:  # the other lines have the keypoints, and may be empty
-        if line.strip():
-            parts = line.split(maxsplit=9)
-            photos.append((parts[9], int(parts[8]), tuple(map(float, parts[1:8]))))
+    lines = iter(image_file.decode().splitlines())
+    for line in lines:
+        if not line.strip() or line.startswith("#"):
+            continue
+        parts = line.split(maxsplit=9)
+        photos.append((parts[9].strip(), int(parts[8]), tuple(map(float, parts[1:8]))))
+        points = next(lines, "").split()  # the line may be empty
+        if len(points) % 3 or not all(each.lstrip("-").isdigit() for each in points[2::3]):
+            raise ValueError(
+                f"the line after image {parts[0]:.20} is not its list of points (x, y, number of "
+                "a point, ...). Write an empty line after each image without points"
+            )
     return numbers, cameras, photos
 
 

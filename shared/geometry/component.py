@@ -5,19 +5,23 @@ from __future__ import annotations
 import io
 import zipfile
 import zlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Self
 from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.geometry.cameras import Camera, Floats
+from shared.geometry.cameras import RAY_TERMS, Camera, Floats, Rays
 
 NO_POINT = -1
 MIN_INFORMATION = 1e-6
 """Least eigenvalue of a point's information as a share of the largest"""
+NO_TERMS = np.zeros((RAY_TERMS, RAY_TERMS, 2))
+NO_RAYS = Rays(NO_TERMS, 0.0, bytes(32), 0)
+MAX_ZOOM = 1.1
+"""Largest ratio of focal lengths of one camera whose photos do not tell them"""
 UNREADABLE = (OSError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
 """What a damaged zip file raises"""
 ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
@@ -28,11 +32,15 @@ ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "keypoints": ("i4", ()),
     "point_numbers": ("i4", ()),
     "cameras": ("f8", (4,)),
+    "rays": ("f8", (RAY_TERMS, RAY_TERMS, 2)),
+    "rays_of": ("f8", (2,)),
+    "camera_keys": ("u1", (32,)),
     "points": ("f8", (3,)),
     "covariances": ("f4", (3, 3)),
     "observations": ("i4", ()),
 }
-"""Name -> dtype and shape of a row; `keypoints` are the numbers of a photo's rows in the next."""
+"""Name -> dtype and shape of a row; `keypoints` are the numbers of a photo's rows in the next.
+`rays_of` are the focal length and the quarter turns of a camera's rays; 0 without rays."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,9 +74,32 @@ class Component:
             [-self.rotation(i).T @ self.translations[i] for i in range(len(self.photo_ids))]
         ).reshape(-1, 3)
 
+    def find_camera(self, camera_key: bytes) -> Camera | None:
+        """Return the camera that took photos with this key: the median one, if they are alike."""
+        found = [each for each in self.cameras if each.rays and each.rays.camera_key == camera_key]
+        found.sort(key=lambda each: each.focal_length)
+        if not found or found[-1].focal_length > MAX_ZOOM * found[0].focal_length:
+            return None
+        return found[len(found) // 2]
+
+    def with_rays(self, rays: Mapping[UUID, Rays]) -> Component:
+        """Return the component with the rays of photos as those of their cameras."""
+        cameras = list(self.cameras)
+        for photo_id, number in zip(self.photo_ids, self.camera_numbers.tolist(), strict=True):
+            if photo_id in rays:
+                cameras[number] = replace(cameras[number], rays=rays[photo_id], radial=0.0)
+        return replace(self, cameras=tuple(cameras))
+
+    def rays(self) -> dict[UUID, Rays]:
+        """Return the rays of the photos whose cameras have some."""
+        numbers = zip(self.photo_ids, self.camera_numbers.tolist(), strict=True)
+        found = ((photo_id, self.cameras[number].rays) for photo_id, number in numbers)
+        return {photo_id: rays for photo_id, rays in found if rays is not None}
+
     def encode(self) -> bytes:
         """Encode as a compressed npz of the arrays in ARRAYS."""
         buffer = io.BytesIO()
+        rays = [camera.rays or NO_RAYS for camera in self.cameras]
         arrays: dict[str, Any] = {
             "photo_ids": np.array([list(i.bytes) for i in self.photo_ids]).reshape(-1, 16),
             "rotations": self.rotations,
@@ -79,6 +110,11 @@ class Component:
             "cameras": np.array(
                 [[c.width, c.height, c.focal_pixels, c.radial] for c in self.cameras]
             ).reshape(-1, 4),
+            "rays": np.array([each.coefficients for each in rays]).reshape(-1, *NO_TERMS.shape),
+            "rays_of": np.array([[each.focal_length, each.quarter_turns] for each in rays]).reshape(
+                -1, 2
+            ),
+            "camera_keys": np.array([list(each.camera_key) for each in rays]).reshape(-1, 32),
             "points": self.points,
             "covariances": self.covariances,
             "observations": self.observations,
@@ -111,7 +147,18 @@ class Component:
             arrays["translations"],
             arrays["camera_numbers"],
             tuple(np.split(arrays["point_numbers"], stops)) if len(arrays["keypoints"]) else (),
-            tuple(Camera(int(w), int(h), f, k) for w, h, f, k in arrays["cameras"].tolist()),
+            tuple(
+                Camera(int(w), int(h), f, k, Rays(terms, of[0], key.tobytes(), int(of[1])))
+                if of[0] > 0
+                else Camera(int(w), int(h), f, k)
+                for (w, h, f, k), terms, of, key in zip(
+                    arrays["cameras"].tolist(),
+                    arrays["rays"],
+                    arrays["rays_of"].tolist(),
+                    arrays["camera_keys"],
+                    strict=True,
+                )
+            ),
             arrays["points"],
             arrays["covariances"],
             arrays["observations"],
@@ -123,6 +170,9 @@ def _check(arrays: dict[str, NDArray[Any]]) -> None:
     for name in ("rotations", "translations", "camera_numbers", "keypoints"):
         if len(arrays[name]) != photos:
             raise ValueError(f"{len(arrays[name])} {name} for {photos} photos")
+    for name in ("rays", "rays_of", "camera_keys"):
+        if len(arrays[name]) != len(arrays["cameras"]):
+            raise ValueError(f"{len(arrays[name])} {name} for {len(arrays['cameras'])} cameras")
     for name in ("covariances", "observations"):
         if len(arrays[name]) != points:
             raise ValueError(f"{len(arrays[name])} {name} for {points} points")

@@ -13,11 +13,9 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pymap3d import ecef2geodetic, enu2geodetic, geodetic2ecef, geodetic2enu
 
 from shared.geometry.cameras import Floats
-
-SEMI_MAJOR_M, FLATTENING = 6_378_137.0, 1 / 298.257223563  # WGS 84
-ECCENTRICITY_2 = FLATTENING * (2 - FLATTENING)
 
 MIN_PHOTOS = 3
 MIN_SPREAD = 0.02
@@ -69,49 +67,18 @@ class EastNorthUp:
         up = [math.cos(phi) * math.cos(lam), math.cos(phi) * math.sin(lam), math.sin(phi)]
         return np.array([east, np.cross(up, east), up])
 
-    @cached_property
-    def _origin(self) -> Floats:
-        place = (self.latitude, self.longitude, self.altitude_m)
-        origin: Floats = _earth_centred(*(np.array(value) for value in place))
-        return origin
-
     def from_geographic(self, latitudes: Any, longitudes: Any, altitudes_m: Any) -> Floats:
         """Return the (n, 3) metres of (n,) degrees, degrees and metres."""
-        places = (np.asarray(v, float) for v in (latitudes, longitudes, altitudes_m))
-        metres: Floats = (_earth_centred(*places) - self._origin) @ self.axes.T
-        return metres
+        places = (np.asarray(values, float) for values in (latitudes, longitudes, altitudes_m))
+        return np.stack(geodetic2enu(*places, *self._point), axis=-1)
 
     def to_geographic(self, metres: Floats) -> EastNorthUp:
-        """Return the point (3,) with the plane that touches the ellipsoid there.
+        """Return the point (3,) with the plane that touches the ellipsoid there."""
+        return EastNorthUp(*map(float, enu2geodetic(*metres, *self._point)))
 
-        The latitude is that of Bowring (Survey Review 28, 1985): exact to a micrometre near the
-        ground.
-        """
-        x, y, z = (self._origin + metres @ self.axes).tolist()
-        from_axis = math.hypot(x, y)
-        semi_minor = SEMI_MAJOR_M * (1 - FLATTENING)
-        theta = math.atan2(z * SEMI_MAJOR_M, from_axis * semi_minor)
-        phi = math.atan2(
-            z + ECCENTRICITY_2 / (1 - ECCENTRICITY_2) * semi_minor * math.sin(theta) ** 3,
-            from_axis - ECCENTRICITY_2 * SEMI_MAJOR_M * math.cos(theta) ** 3,
-        )
-        normal = SEMI_MAJOR_M / math.sqrt(1 - ECCENTRICITY_2 * math.sin(phi) ** 2)
-        altitude = from_axis * math.cos(phi) + z * math.sin(phi) - SEMI_MAJOR_M**2 / normal
-        return EastNorthUp(math.degrees(phi), math.degrees(math.atan2(y, x)), altitude)
-
-
-def _earth_centred(latitudes: Floats, longitudes: Floats, altitudes_m: Floats) -> Floats:
-    phi, lam = np.radians(latitudes), np.radians(longitudes)
-    normal = SEMI_MAJOR_M / np.sqrt(1 - ECCENTRICITY_2 * np.sin(phi) ** 2)
-    across = (normal + altitudes_m) * np.cos(phi)
-    return np.stack(
-        [
-            across * np.cos(lam),
-            across * np.sin(lam),
-            (normal * (1 - ECCENTRICITY_2) + altitudes_m) * np.sin(phi),
-        ],
-        axis=-1,
-    )
+    @property
+    def _point(self) -> tuple[float, float, float]:
+        return self.latitude, self.longitude, self.altitude_m
 
 
 @dataclass(frozen=True)
@@ -304,10 +271,9 @@ def _level(axes: Floats) -> Floats:
 
 def plane_at(latitudes: Floats, longitudes: Floats, altitude_m: float) -> EastNorthUp:
     """Return the plane at the middle of the places, also around a pole or the antimeridian."""
-    middle = np.median(_earth_centred(latitudes, longitudes, np.zeros(len(latitudes))), axis=0)
-    first = EastNorthUp(float(latitudes[0]), float(longitudes[0]))
-    found = first.to_geographic((middle - first._origin) @ first.axes.T)
-    return EastNorthUp(found.latitude, found.longitude, altitude_m)
+    earth_centred = geodetic2ecef(latitudes, longitudes, np.zeros(len(latitudes)))
+    latitude, longitude, _ = ecef2geodetic(*np.median(earth_centred, axis=1))
+    return EastNorthUp(float(latitude), float(longitude), altitude_m)
 
 
 def umeyama(points: Floats, targets: Floats, weights: Floats) -> tuple[float, Floats, Floats]:

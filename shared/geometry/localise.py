@@ -117,8 +117,9 @@ def localise(
     places = _candidates_in(components, candidates, leave_out)
     if not places:
         return NoPose("None of the best photos of the map is in the model.")
+    pixels = query.pixels() if camera is None else camera.undistort(query.pixels())
     groups = [
-        _match(query, group, components, matcher, leave_out)
+        _match(query, pixels, group, components, matcher, leave_out)
         for group in _group_by_place(places, components)
     ]
     groups = sorted(groups, key=lambda pairs: -len(pairs.pixels))[:MAX_PLACES]
@@ -152,7 +153,7 @@ def localise(
         pose.camera,
         source,
         components[pairs.component].points[pairs.point_numbers[pose.is_inlier]],
-        pairs.pixels[pose.is_inlier],
+        query.pixels()[pairs.keypoint_numbers[pose.is_inlier]],
     )
 
 
@@ -262,12 +263,17 @@ def _group_by_place(
 
 def _match(
     query: LocalFeatures,
+    pixels: Floats,
     group: Sequence[tuple[int, int, LocalFeatures]],
     components: Sequence[Component],
     matcher: Matcher,
     leave_out: AbstractSet[UUID],
 ) -> _Pairs:
-    """Match the query with the photos of a place; each pair counts once."""
+    """Match the query with the photos of a place; each pair counts once.
+
+    Args:
+        pixels: (keypoints, 2) of the query, undistorted; NaN where the camera knows no ray.
+    """
     number = group[0][0]
     component = components[number]
     is_seen = _seen_by_others(component, leave_out)
@@ -278,11 +284,12 @@ def _match(
         is_point = (points >= 0) & is_seen[points]
         found.append(np.column_stack([matches[is_point, 0], points[is_point]]))
     pairs = np.unique(np.concatenate(found), axis=0)
+    pairs = pairs[np.isfinite(pixels[pairs[:, 0]]).all(axis=1)]
     return _Pairs(
         number,
         tuple(row for _, row, _ in group),
         pairs[:, 0].astype(np.int32),
-        query.pixels()[pairs[:, 0]],
+        pixels[pairs[:, 0]],
         pairs[:, 1].astype(np.int32),
     )
 

@@ -16,10 +16,12 @@ set wrong, a photo that another person took, a wrong fix.
 from __future__ import annotations
 
 import math
+import re
 from bisect import bisect_left, insort
 from collections.abc import Sequence
-from dataclasses import dataclass
-from datetime import datetime
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from typing import TypeVar
 
 import numpy as np
 
@@ -32,6 +34,14 @@ SPACING_M = 12.0
 FIX_ACCURACY_M = 12.0
 """Standard deviation of a position in a photo or a GPX track"""
 OUTLIER_SHARE = 0.02
+SAME_CAMERA_SHARE = 0.5
+"""Of two photos by one model, of which nothing says that one camera took both: that it did"""
+COMPANION_SIGMA_M = 500.0
+"""Standard deviation between the cameras of people whose photos are in one folder"""
+MAX_SKIPPED_NUMBERS = 20
+"""Between two file names of one series: photos that were deleted or lie elsewhere"""
+COUNTER = re.compile(r"(.*?)(\d{1,7})((?: \(\d+\))?\.[^.]*)")
+DATE_DIGITS = 8  # in a row: a name made of the time says nothing about the camera
 WRONG_POSE_SHARE = 0.02
 """Of poses, at most: 1 % of the accepted ones are wrong, and a radius may be too small"""
 RAYLEIGH_68 = 1.51
@@ -108,6 +118,13 @@ class DatedPhoto:
     camera: str | None
     latitude: float | None
     longitude: float | None
+    clock_offset: timedelta | None = None
+    """of the camera's clock from UTC, if it is known"""
+    camera_is_unique: bool = False
+    """`camera` contains a serial number or an owner"""
+
+
+Dated = TypeVar("Dated", bound=DatedPhoto)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +139,8 @@ class InterpolatedPosition:
     """in time"""
     seconds: float
     """from the nearest to the photo; negative if the photo was taken before"""
+    same_camera: bool = True
+    """whether something says that the same camera took them, not only one of the same model"""
 
 
 def picture_mixture(evidence: PictureEvidence, plane: Plane) -> Mixture:
@@ -213,10 +232,38 @@ def interpolate_position(
     )
 
 
+def add_time_zones(photos: Sequence[Dated]) -> list[Dated]:
+    """Give clocks without a time zone that of the photo by the same camera that is nearest in time.
+
+    Its zone is known by its tag, or because it has the time of the clock and that of the GPS.
+    """
+    zones: dict[str, list[tuple[datetime, timedelta]]] = {}
+    for photo in photos:
+        if photo.camera and photo.time and photo.clock_offset is not None:
+            clock = photo.time + photo.clock_offset
+            insort(zones.setdefault(photo.camera, []), (clock, photo.clock_offset))
+    return [
+        _with_nearest_zone(photo, zones[photo.camera])
+        if photo.camera in zones and photo.time and not photo.time_zone_is_known
+        else photo
+        for photo in photos
+    ]
+
+
+def _with_nearest_zone(photo: Dated, zones: Sequence[tuple[datetime, timedelta]]) -> Dated:
+    clock = photo.time
+    assert clock is not None
+    index = bisect_left(zones, clock, key=lambda each: each[0])
+    _, offset = min(zones[max(index - 1, 0) : index + 1], key=lambda each: abs(each[0] - clock))
+    return replace(photo, time=clock - offset, time_zone_is_known=True, clock_offset=offset)
+
+
 class TimeNeighbours:
     """The photos with time and coordinates, by the camera whose times and way they show.
 
     The times of one camera can be compared without their time zone, but not with times in UTC.
+    Photos by one model are of one camera if that has a serial number or an owner, or if their names
+    are a series in the order of their times. Otherwise another phone may have taken them.
 
     Args:
         together: Whether the people with the cameras travelled together.
@@ -224,30 +271,79 @@ class TimeNeighbours:
 
     def __init__(self, photos: Sequence[DatedPhoto], together: bool) -> None:
         self._together = together
-        self._known: dict[tuple[str, bool] | None, list[KnownPosition]] = {}
+        self._series = _file_series(photos)
+        self._known: dict[object, list[KnownPosition]] = {}
         for photo in photos:
             if photo.time is None or photo.latitude is None or photo.longitude is None:
                 continue
             position = KnownPosition(photo.time, photo.latitude, photo.longitude, photo.name)
-            known = self._known.setdefault(self._clock(photo), [])
-            insort(known, position, key=lambda each: each.time)
-        self._known.pop(None, None)
+            for clock in {self._camera(photo), self._model(photo)} - {None}:
+                known = self._known.setdefault(clock, [])
+                insort(known, position, key=lambda each: each.time)
 
     def position_of(self, photo: DatedPhoto, max_speed_mps: float) -> InterpolatedPosition | None:
         """Interpolate the position of a photo without coordinates; None if nothing is known."""
-        known = self._known.get(self._clock(photo), ())
         if photo.time is None:
             return None
-        return interpolate_position(known, photo.time, max_speed_mps)
+        known = self._known.get(self._camera(photo), ())
+        position = interpolate_position(known, photo.time, max_speed_mps)
+        if position is not None:
+            return position
+        known = self._known.get(self._model(photo), ())
+        position = interpolate_position(known, photo.time, max_speed_mps)
+        return position and replace(position, same_camera=False)
 
-    def _clock(self, photo: DatedPhoto) -> tuple[str, bool] | None:
-        """Return what photos with comparable times have in common; None for unknown cameras."""
+    def why_unknown(self, photo: DatedPhoto) -> str:
+        """Say why nothing is known about the place of a photo."""
+        if photo.time is not None and not photo.time_zone_is_known:
+            return "nothing is known about its place, and the time zone of its clock is missing"
+        return "nothing is known about its place"
+
+    def _camera(self, photo: DatedPhoto) -> object:
+        """Return what photos of one camera have in common; None if that is unknown."""
         if self._together:
             return "", photo.time_zone_is_known
-        return None if photo.camera is None else (photo.camera, photo.time_zone_is_known)
+        if photo.camera_is_unique:
+            return photo.camera, photo.time_zone_is_known
+        return self._series.get(photo.name)
+
+    def _model(self, photo: DatedPhoto) -> object:
+        """Return what photos of one model have in common, unless they are of known cameras."""
+        if self._together or photo.camera_is_unique or photo.camera is None:
+            return None
+        return photo.camera, photo.time_zone_is_known
+
+
+def _file_series(photos: Sequence[DatedPhoto]) -> dict[str, object]:
+    """Return the series by the name of the photo: numbers that grow with the times."""
+    groups: dict[tuple[str, ...], list[tuple[int, datetime, str]]] = {}
+    for photo in photos:
+        folder, _, name = photo.name.rpartition("/")
+        match = COUNTER.fullmatch(name)
+        digits = re.findall(r"\d+", name)
+        is_date = len(digits) > 1 and any(len(run) >= DATE_DIGITS for run in digits)
+        if match and photo.time and photo.camera and not is_date:
+            key = photo.camera, str(photo.time_zone_is_known), folder, match[1]
+            groups.setdefault(key, []).append((int(match[2]), photo.time, photo.name))
+    series: dict[str, object] = {}
+    for group, members in groups.items():
+        if len({each[:2] for each in members}) > len({number for number, *_ in members}):
+            continue  # two cameras count the same numbers
+        begin = last = min(members)
+        for member in sorted(members):
+            if member[0] - last[0] > MAX_SKIPPED_NUMBERS or member[1] < last[1]:
+                begin = member
+            series[member[2]] = (*group, begin[0])
+            last = member
+    return series
 
 
 def position_mixture(position: InterpolatedPosition, plane: Plane) -> Mixture:
     """Return the density of the position according to positions of known times."""
     mean = plane.to_metres(position.latitude, position.longitude)
-    return Mixture.of([(mean, position.sigma_m, 1 - OUTLIER_SHARE)], OUTLIER_SHARE)
+    components = [(mean, position.sigma_m, 1 - OUTLIER_SHARE)]
+    if not position.same_camera:
+        sigma = math.hypot(position.sigma_m, COMPANION_SIGMA_M)
+        share = SAME_CAMERA_SHARE * (1 - OUTLIER_SHARE)
+        components = [(mean, position.sigma_m, share), (mean, sigma, 1 - OUTLIER_SHARE - share)]
+    return Mixture.of(components, OUTLIER_SHARE)

@@ -60,6 +60,8 @@ def propose_position(
         sources.append((mixture, "", "looks like another place"))
     if neighbours is not None:
         text = f"taken {_after(neighbours.seconds)} {neighbours.nearest.name}"
+        if not neighbours.same_camera:
+            text += ", perhaps by another camera of the same model"
         sources.append((position_mixture(neighbours, plane), text, f"not where it was {text}"))
     if track is not None:
         text = f"GPX track, {_duration(track.seconds)} from its nearest point"

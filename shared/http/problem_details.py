@@ -18,7 +18,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from shared.catalog.database.errors import reason_of, to_unavailable
-from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
+from shared.errors import InvalidRequest, PlacewiseError, Unprocessable, shorten
 from shared.ids import new_id
 from shared.telemetry.tracing import REQUEST_ID_HEADER
 
@@ -29,6 +29,8 @@ REQUEST_ID_SCOPE_KEY = "placewise.request_id"
 """ASGI scope key of the request id, in services that assign one."""
 CLOSED_STATUS_SCOPE_KEY = "placewise.closed_with"
 """ASGI scope key of the status that the server sent itself before it closed the connection."""
+MAX_REPORTED_ERRORS = 20  # of invalid fields
+MAX_FIELD_CHARACTERS = 200
 CLIENT_GONE = 499
 """Status of a request whose client closed the connection; only for logs and metrics."""
 HTTP_CODES = {400: "malformed_body", 404: "path_not_found", 405: "method_not_allowed"}
@@ -120,12 +122,14 @@ async def _handle_validation_error(request: Request, error: Exception) -> JSONRe
     else:
         errors = [
             {
-                "field": ".".join(str(part) for part in failure["loc"][1:]),
+                "field": shorten(".".join(map(str, failure["loc"][1:])), MAX_FIELD_CHARACTERS),
                 "detail": "is unknown" if failure["type"] == "extra_forbidden" else failure["msg"],
             }
-            for failure in failures
+            for failure in failures[:MAX_REPORTED_ERRORS]
         ]
         detail = "; ".join(f"{e['field'] or 'body'}: {e['detail']}" for e in errors)
+        if len(failures) > len(errors):
+            detail += f"; and {len(failures) - len(errors)} more errors"
         problem = Unprocessable("invalid_field", detail, errors=errors)
     return problem_response(problem, request)
 

@@ -7,6 +7,9 @@ computes, and a process for each header would cost more than the header.
 
 from __future__ import annotations
 
+import io
+from collections.abc import Iterator
+from itertools import count
 from typing import BinaryIO
 
 # Of all parts of a header together: boxes, segments, chunks, entries. A photo of 200 megapixels in
@@ -22,10 +25,14 @@ MAX_OFFSET = 2**62  # files are smaller, and can't seek much further
 class BoundedReader:
     """Reads parts of a file; each part is a step, and all of them together are limited."""
 
-    def __init__(self, file: BinaryIO) -> None:
+    def __init__(self, file: BinaryIO, steps: Iterator[int] | None = None) -> None:
         self._file = file
         self._position = file.seek(0)
-        self._steps = 0
+        self._steps = steps or count(1)
+
+    def of_part(self, data: bytes) -> BoundedReader:
+        """Return a reader of a part that was read; its steps count as those of this one."""
+        return BoundedReader(io.BytesIO(data), self._steps)
 
     def step(self) -> None:
         """Count a step of a loop that reads nothing.
@@ -33,8 +40,7 @@ class BoundedReader:
         Raises:
             ValueError: The header has more than MAX_STEPS parts.
         """
-        self._steps += 1
-        if self._steps > MAX_STEPS:
+        if next(self._steps) > MAX_STEPS:
             raise ValueError(f"its header has more than {MAX_STEPS} parts")
 
     def read(self, offset: int, size: int) -> bytes:

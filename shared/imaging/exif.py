@@ -7,6 +7,7 @@ most MAX_VALUE_BYTES. The format is TIFF 6.0, page 13, and BigTIFF.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Collection, Iterator
 from typing import Any, NamedTuple
@@ -61,22 +62,30 @@ class TiffBlock:
             self._unpack("Q", reader.read(8, 8)) if self._big else self._unpack("I", head[4:])
         )[0]
 
-    def read_directory(self, offset: int, tags: Collection[int]) -> dict[int, Any]:
+    def read_directory(
+        self, offset: int, tags: Collection[int], max_value_bytes: int = MAX_VALUE_BYTES
+    ) -> dict[int, Any]:
         """Read the given tags of the directory at `offset`.
 
         Returns:
-            By tag: text, bytes, a number, or a tuple of several. Fractions are floats, and not a
-            number where they divide by zero. Broken and oversized values are left out.
+            By tag: text, bytes, a number, or a tuple of several; None for a tag whose value is
+            broken or oversized. Fractions are floats: 0/0 is not a number, and 1/0 infinite.
 
         Raises:
             ValueError: The directory is beyond the end.
         """
         values: dict[int, Any] = {}
         for entry in self._entries(offset, tags):
-            value = None if entry.tag in values else self._value(entry)
-            if value is not None:
-                values[entry.tag] = value
+            value = self._value(entry, max_value_bytes)
+            values[entry.tag] = values.get(entry.tag) if value is None else value
         return values
+
+    def has_next_directory(self, offset: int) -> bool:
+        """Return whether another directory follows, which is another picture of a TIFF file."""
+        letter, entry_size = ("Q", 20) if self._big else ("H", 12)
+        size = struct.calcsize(letter)
+        (count,) = self._unpack(letter, self._reader.read(offset, size))
+        return any(self._reader.read(offset + size + count * entry_size, 8 if self._big else 4))
 
     def read_bytes(self, offset: int, tag: int, max_bytes: int) -> bytes | None:
         """Read the bytes of a tag; None if it is missing or has more than `max_bytes`."""
@@ -94,8 +103,8 @@ class TiffBlock:
             if values[0] in tags:
                 yield _Entry(*values)
 
-    def _value(self, entry: _Entry) -> Any:
-        data = self._data(entry, MAX_VALUE_BYTES)
+    def _value(self, entry: _Entry, max_bytes: int) -> Any:
+        data = self._data(entry, max_bytes)
         if not data:
             return None
         if entry.type == ASCII:
@@ -105,7 +114,7 @@ class TiffBlock:
         numbers: tuple[float, ...] = self._unpack(TYPES[entry.type] * entry.length, data)
         if entry.type in RATIONALS:
             pairs = zip(numbers[::2], numbers[1::2], strict=True)
-            numbers = tuple(n / d if d else float("nan") for n, d in pairs)
+            numbers = tuple(n / d if d else math.inf * n for n, d in pairs)  # inf * 0 is nan
         return numbers[0] if len(numbers) == 1 else numbers
 
     def _data(self, entry: _Entry, max_bytes: int) -> bytes | None:

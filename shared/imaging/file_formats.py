@@ -28,7 +28,10 @@ PHOTO_READ_ERRORS = (
     struct.error,
 )
 # Suffixes searched for in folders and archives; the format is detected from the content.
-PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif"}
+PHOTO_SUFFIXES = {
+    *(".jpg", ".jpeg", ".jpe", ".jfif"),
+    *(".png", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif"),
+}
 PHOTO_SIGNATURE_BYTES = 16  # enough to detect every accepted format
 ARCHIVE_SIGNATURES = (b"PK\x03\x04", b"\x1f\x8b\x08")  # zip, gzip
 

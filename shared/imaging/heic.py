@@ -1,4 +1,4 @@
-"""Size and EXIF of a HEIC photo, without its decoder, which is optional.
+"""Size, EXIF and XMP of a HEIC photo, without its decoder, which is optional.
 
 A HEIC file is a tree of boxes (ISO/IEC 14496-12): each has a length, a name of four letters and
 content. `meta` lists the items (ISO/IEC 23008-12): the image, its tiles, its EXIF; properties in
@@ -15,7 +15,10 @@ from dataclasses import dataclass
 from shared.imaging.bounded_reader import MAX_METADATA_BYTES, BoundedReader
 
 HEVC = (b"hvc1", b"grid")  # a single image, or a grid of tiles as phones write it
+XMP_TYPE = b"application/rdf+xml"
 QUARTER_TURNS = 4
+Extents = list[tuple[int, int]]
+"""(offset, length) of the parts of an item"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,10 +27,24 @@ class _Box:
     content: bytes
 
 
-def read_heic(reader: BoundedReader) -> tuple[int, int, bytes | None]:
-    """Return upright width and height of the primary image, and its EXIF as a TIFF block.
+@dataclass(frozen=True, slots=True)
+class HeicContent:
+    """What the boxes of a HEIC photo say."""
 
-    Raises ValueError if there is none, or if it is not HEVC (AVIF, for example).
+    width: int
+    """upright, of the primary image"""
+    height: int
+    exif: list[bytes | None]
+    """TIFF blocks; None for one that is not read: it is too large, or not stored as an item"""
+    xmp: list[bytes | None]
+    picture: Extents
+    """of the images and tiles; empty if one is not stored in the file itself"""
+
+
+def read_heic(reader: BoundedReader) -> HeicContent:
+    """Read the boxes of a HEIC photo.
+
+    Raises ValueError if it has no primary image, or if it is not HEVC (AVIF, for example).
     """
     boxes = {box.name: box.content for box in _boxes(reader, _meta(reader))}
     primary = _primary(boxes[b"pitm"])
@@ -35,9 +52,22 @@ def read_heic(reader: BoundedReader) -> tuple[int, int, bytes | None]:
     if kinds.get(primary) not in HEVC:
         raise ValueError("its primary picture is not HEVC")
     width, height = _upright_size(reader, boxes[b"iprp"], primary)
-    exif_item = next((item for item, kind in kinds.items() if kind == b"Exif"), None)
-    exif = None if exif_item is None else _exif(reader, boxes.get(b"iloc", b""), exif_item)
-    return width, height, exif
+    stored = _extents(reader, boxes.get(b"iloc", b""))
+    images = [stored.get(item, []) for item, kind in sorted(kinds.items()) if kind == b"hvc1"]
+    blocks = {
+        kind: [_item(reader, stored.get(item, [])) for item, each in kinds.items() if each == kind]
+        for kind in (b"Exif", XMP_TYPE)
+    }
+    return HeicContent(
+        width,
+        height,
+        [
+            block and (block[4 + int.from_bytes(block[:4], "big") :] or None)
+            for block in blocks[b"Exif"]
+        ],
+        blocks[XMP_TYPE],
+        [extent for extents in images for extent in extents] if all(images) else [],
+    )
 
 
 def _meta(reader: BoundedReader) -> bytes:
@@ -75,12 +105,14 @@ def _primary(data: bytes) -> int:
 
 
 def _kinds(reader: BoundedReader, data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield (item, item type) of each entry of `iinf`."""
+    """Yield item and type of each entry of `iinf`; the type of XMP is XMP_TYPE."""
     for box in _boxes(reader, data[6 if data[0] == 0 else 8 :]):
         version = box.content[0]
         if box.name == b"infe" and version >= 2:
-            item, _, kind = struct.unpack_from(">HH4s" if version == 2 else ">IH4s", box.content, 4)
-            yield item, kind
+            letters = ">HH4s" if version == 2 else ">IH4s"
+            item, _, kind = struct.unpack_from(letters, box.content, 4)
+            names = box.content[4 + struct.calcsize(letters) :].split(b"\0")  # item, content type
+            yield item, XMP_TYPE if kind == b"mime" and XMP_TYPE in names[1:2] else kind
 
 
 def _upright_size(reader: BoundedReader, data: bytes, item: int) -> tuple[int, int]:
@@ -119,22 +151,20 @@ def _properties_of(reader: BoundedReader, data: bytes, item: int) -> list[int]:
     return []
 
 
-def _exif(reader: BoundedReader, data: bytes, item: int) -> bytes | None:
-    """Return the TIFF block of the EXIF item; None unless it is one extent of this file."""
-    extent = _extent(reader, data, item)
-    if extent is None or not 4 < extent[1] <= MAX_METADATA_BYTES:
+def _item(reader: BoundedReader, extents: Extents) -> bytes | None:
+    """Return the bytes of an item; None if it has none in this file, or is too large."""
+    if not 4 < sum(length for _, length in extents) <= MAX_METADATA_BYTES:
         return None
-    block = reader.read_available(*extent)
-    if len(block) < 4:
-        return None
-    begin = 4 + struct.unpack_from(">I", block)[0]
-    return block[begin:] or None
+    parts = [reader.read_available(*extent) for extent in extents]
+    is_whole = all(len(part) == length for part, (_, length) in zip(parts, extents, strict=True))
+    return b"".join(parts) if is_whole else None
 
 
-def _extent(reader: BoundedReader, data: bytes, item: int) -> tuple[int, int] | None:
-    """Return (offset, length) of an item in the file, by `iloc`; None if it has several extents."""
+def _extents(reader: BoundedReader, data: bytes) -> dict[int, Extents]:
+    """Return the extents of the items in the file, by `iloc`; empty for those elsewhere."""
+    stored: dict[int, Extents] = {}
     if len(data) < 8:
-        return None
+        return stored
     version = data[0]
     offset_size, length_size = data[4] >> 4, data[4] & 15
     base_size, index_size = data[5] >> 4, data[5] & 15 if version else 0
@@ -154,14 +184,13 @@ def _extent(reader: BoundedReader, data: bytes, item: int) -> tuple[int, int] | 
 
     for _ in range(entries):
         reader.step()
-        entry = number(4 if wide else 2)
+        item = number(4 if wide else 2)
         method = number(2) & 15 if version else 0
-        source, base, extents = number(2), number(base_size), number(2)
-        if entry != item:
-            position += extents * (index_size + offset_size + length_size)
-            continue
-        if method or source or extents != 1:
-            return None
-        number(index_size)
-        return base + number(offset_size), number(length_size)
-    return None
+        source, base, count = number(2), number(base_size), number(2)
+        extents = []
+        for _ in range(count):
+            reader.step()
+            number(index_size)
+            extents.append((base + number(offset_size), number(length_size)))
+        stored[item] = [] if method or source else extents
+    return stored

@@ -1,46 +1,44 @@
 """Photo headers: size, location and capture time, read without decoding pixels.
 
-EXIF is untrusted: fields that are missing, broken or out of range become None. The cost of a header
+EXIF and XMP are untrusted: fields that are missing, broken or out of range become None, and
+coordinates that are there but not understood give a reason. The cost of a header
 is bounded whatever the file says (`shared.imaging.bounded_reader`).
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Collection
-from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timedelta
+from operator import index
 from typing import Any, BinaryIO, cast
 
 from PIL.ExifTags import GPS, IFD, Base
 
 from shared.errors import Unprocessable
 from shared.geometry.cameras import focal_length_from_exif
+from shared.imaging.capture_place import CapturePlace, read_place, true_heading
+from shared.imaging.capture_time import read_time
 from shared.imaging.exif import TiffBlock
 from shared.imaging.file_formats import PHOTO_READ_ERRORS, check_pixel_count
-from shared.imaging.file_structure import read_structure
+from shared.imaging.file_structure import Metadata, read_structure
+from shared.imaging.xmp import PLACE_PROPERTIES, read_xmp
 
 MAIN_TAGS = (Base.Orientation, Base.Make, Base.Model, IFD.Exif, IFD.GPSInfo)
 CAMERA_TAGS = (
-    *(Base.DateTimeOriginal, Base.OffsetTimeOriginal, Base.BodySerialNumber),
+    *(Base.DateTimeOriginal, Base.OffsetTimeOriginal, Base.SubsecTimeOriginal),
+    *(Base.DateTimeDigitized, Base.OffsetTimeDigitized, Base.SubsecTimeDigitized),
+    *(Base.CameraOwnerName, Base.BodySerialNumber),
     *(Base.FocalLengthIn35mmFilm, Base.FocalLength),
     *(Base.FocalPlaneXResolution, Base.FocalPlaneResolutionUnit),
     *(Base.ExifImageWidth, Base.ExifImageHeight),
 )
-GPS_TAGS = (
-    GPS.GPSLatitudeRef,
-    GPS.GPSLatitude,
-    GPS.GPSLongitudeRef,
-    GPS.GPSLongitude,
-    GPS.GPSAltitudeRef,
-    GPS.GPSAltitude,
-    GPS.GPSTimeStamp,
-    GPS.GPSDateStamp,
-    GPS.GPSImgDirection,
-)
+GPS_TAGS = tuple(GPS[name] for name in (*PLACE_PROPERTIES, "GPSDateStamp", "GPSTimeStamp"))
 ROTATED_ORIENTATIONS = (5, 6, 7, 8)  # EXIF orientations that swap width and height
-BELOW_ZERO = (b"\1", b"\3")  # GPSAltitudeRef: below the sea, below the ellipsoid
-MAX_ALTITUDE_M = 100_000
+QUARTER_TURNS = {1: 0, 6: 1, 3: 2, 8: 3, **dict.fromkeys((2, 4, 5, 7))}  # clockwise; None: mirrored
+READ_BYTES = 1024 * 1024
 EXIF_INCH = 2  # the default of FocalPlaneResolutionUnit
 
 
@@ -57,18 +55,60 @@ class PhotoHeader:
     altitude: float | None = None
     """metres, as the camera's GPS gives them"""
     heading: float | None = None
-    """degrees clockwise from north, in [0, 360)"""
+    """degrees clockwise from true north, in [0, 360)"""
+    has_heading: bool = False
+    """Whether there is a heading, also a magnetic one that can't be converted."""
     captured_at: datetime | None = None
     """UTC; if `time_zone_is_known` is False, the camera's clock as if it were UTC"""
     time_zone_is_known: bool = False
+    clock_offset: timedelta | None = None
+    """of the camera's clock from UTC, if its tag or the GPS time says it"""
     camera: str | None = None
-    """make, model and serial number"""
+    """make, model, owner and serial number"""
+    camera_is_unique: bool = False
+    """Whether the owner or the serial number is known."""
     focal_length: float | None = None
     """multiple of the longer side"""
+    gps_error: str | None = None
+    """why the photo may have coordinates although none are known; such a photo is never changed"""
+    picture: PictureData | None = field(default=None, compare=False)
+    quarter_turns: int | None = 0
+    """clockwise, by which EXIF says that the pixels are turned upright; None if also mirrored"""
+
+    @property
+    def camera_key(self) -> str | None:
+        """What photos of one camera, zoom and size have in common; None without make and model."""
+        if self.camera is None or self.quarter_turns is None:
+            return None
+        size = (self.width, self.height)[:: -1 if self.quarter_turns % 2 else 1]
+        return f"{self.camera} {size[0]}x{size[1]} {self.focal_length or 0:.3f}"
 
 
-def read_photo_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
+@dataclass(frozen=True, slots=True)
+class PictureData:
+    """The parts of a photo's file that hold the picture, without its metadata."""
+
+    size_and_orientation: str
+    parts: Sequence[tuple[int, int]]
+    """(offset, length); the last may end behind the file"""
+
+    def sha256(self, file: BinaryIO, path: str) -> str:
+        """Return the hash of the picture under this path, which other metadata does not change."""
+        digest = hashlib.sha256(f"{self.size_and_orientation} {path}".encode())
+        for offset, left in self.parts:
+            file.seek(offset)
+            while left and (piece := file.read(min(left, READ_BYTES))):
+                digest.update(piece)
+                left -= len(piece)
+        return digest.hexdigest()
+
+
+def read_photo_header(
+    file: BinaryIO, max_pixels: int, sidecars: Sequence[bytes] = ()
+) -> PhotoHeader:
     """Read a photo's header from its beginning.
+
+    Coordinates and time are those of the EXIF, or else of the XMP in the file, or of a sidecar.
 
     Raises Unprocessable: `undecodable_photo`, `too_many_pixels`.
     """
@@ -76,42 +116,81 @@ def read_photo_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
         structure = read_structure(file)
     except (OSError, ValueError) as error:
         raise Unprocessable("undecodable_photo", f"The photo can't be decoded: {error}.") from error
-    width, height, exif = structure.width, structure.height, structure.exif
+    width, height, metadata = structure.width, structure.height, structure.metadata
     check_pixel_count(width, height, max_pixels)
-    main = _directory(exif, exif and exif.first_offset, MAIN_TAGS)
-    if not structure.is_upright and main.get(Base.Orientation) in ROTATED_ORIENTATIONS:
+    reader = _ExifReader(metadata)
+    main, details, gps = reader.read()
+    orientation = 1 if structure.is_upright else main.get(Base.Orientation) or 1
+    if orientation in ROTATED_ORIENTATIONS:
         width, height = height, width
-    details = _directory(exif, main.get(IFD.Exif), CAMERA_TAGS)
-    gps = _directory(exif, main.get(IFD.GPSInfo), GPS_TAGS)
-    latitude = _degrees(gps.get(GPS.GPSLatitude), gps.get(GPS.GPSLatitudeRef), "NS", limit=90)
-    longitude = _degrees(gps.get(GPS.GPSLongitude), gps.get(GPS.GPSLongitudeRef), "EW", limit=180)
-    if latitude is None or longitude is None:
-        latitude = longitude = None
-    heading = _number(gps.get(GPS.GPSImgDirection))
-    gps_time = _gps_time(gps)
-    clock, time_zone_is_known = _clock_time(details)
+    sources: list[Mapping[str, Any]] = [
+        {Base(tag).name: value for tag, value in details.items()}
+        | {GPS(tag).name: value for tag, value in gps.items()}
+    ]
+    unread = metadata.unread
+    for packet in (*metadata.xmp, *sidecars):
+        try:
+            sources.append(read_xmp(packet))
+        except ValueError as error:
+            unread = str(error)
+    time = read_time(sources)
+    places = [read_place(tags) for tags in sources]
+    located = next((place for place in places if place.latitude is not None), CapturePlace())
+    errors = (*(place.error for place in places), unread)
+    headings = (
+        true_heading(
+            replace(place, latitude=located.latitude, longitude=located.longitude), time.captured_at
+        )
+        for place in places
+    )
+    camera, is_unique = _camera(main, details)
+    parts = structure.picture
     return PhotoHeader(
         width=width,
         height=height,
-        latitude=latitude,
-        longitude=longitude,
-        altitude=_altitude(gps),
-        heading=heading % 360 if heading is not None else None,
-        captured_at=gps_time or clock,
-        time_zone_is_known=gps_time is not None or time_zone_is_known,
-        camera=_camera(main, details),
+        latitude=located.latitude,
+        longitude=located.longitude,
+        altitude=next((p.altitude for p in places if p.altitude is not None), None),
+        heading=next((heading for heading in headings if heading is not None), None),
+        has_heading=any(place.heading is not None for place in places),
+        captured_at=time.captured_at,
+        time_zone_is_known=time.time_zone_is_known,
+        clock_offset=time.clock_offset,
+        camera=camera,
+        camera_is_unique=is_unique,
         focal_length=_focal_length(details, structure.width, structure.height),
+        gps_error=next(filter(None, errors), None) if located.latitude is None else None,
+        picture=PictureData(f"{width} {height} {orientation}", parts) if parts else None,
+        quarter_turns=QUARTER_TURNS.get(orientation, 0) if isinstance(orientation, int) else 0,
     )
 
 
-def _directory(exif: TiffBlock | None, offset: Any, tags: Collection[int]) -> dict[int, Any]:
-    """Return the given tags of one of EXIF's directories; empty if it is missing or broken."""
-    if exif is None or not isinstance(offset, int):
-        return {}
-    try:
-        return exif.read_directory(offset, tags)
-    except PHOTO_READ_ERRORS:
-        return {}
+class _ExifReader:
+    """Reads the directories of all EXIF blocks of a photo, and notes those that are broken."""
+
+    def __init__(self, metadata: Metadata) -> None:
+        self._metadata = metadata
+
+    def read(self) -> tuple[dict[int, Any], dict[int, Any], dict[int, Any]]:
+        """Return the tags of the main directory, of the camera's and of the GPS."""
+        main: dict[int, Any] = {}
+        details: dict[int, Any] = {}
+        gps: dict[int, Any] = {}
+        for block in self._metadata.exif:
+            found = self._directory(block, block.first_offset, MAIN_TAGS)
+            main |= found
+            if IFD.Exif in found:
+                details |= self._directory(block, found[IFD.Exif], CAMERA_TAGS)
+            if IFD.GPSInfo in found:
+                gps |= self._directory(block, found[IFD.GPSInfo], GPS_TAGS)
+        return main, details, gps
+
+    def _directory(self, block: TiffBlock, offset: Any, tags: Collection[int]) -> dict[int, Any]:
+        try:
+            return block.read_directory(index(offset), tags)
+        except PHOTO_READ_ERRORS:
+            self._metadata.unread = "its EXIF is damaged"
+            return {}
 
 
 def _number(value: Any) -> float | None:
@@ -120,33 +199,6 @@ def _number(value: Any) -> float | None:
     except (TypeError, ValueError, ZeroDivisionError):
         return None
     return number if math.isfinite(number) else None
-
-
-def _degrees(parts: Any, reference: Any, signs: str, limit: float) -> float | None:
-    """Convert EXIF's (degrees, minutes, seconds); `signs` are the letters of + and -.
-
-    Returns None without a valid letter, because the hemisphere is unknown.
-    """
-    if not isinstance(parts, tuple) or len(parts) != 3 or not isinstance(reference, str):
-        return None
-    sign = signs.find(reference.strip("\0 ").upper()[:1] or "?")
-    if sign < 0:
-        return None
-    numbers = [_number(part) for part in parts]
-    if any(number is None for number in numbers):
-        return None
-    degrees, minutes, seconds = (number or 0.0 for number in numbers)
-    value = degrees + minutes / 60 + seconds / 3600
-    if sign:
-        value = -value
-    return value if abs(value) <= limit else None
-
-
-def _altitude(gps: dict[int, Any]) -> float | None:
-    altitude = _number(gps.get(GPS.GPSAltitude))
-    if altitude is None or not abs(altitude) <= MAX_ALTITUDE_M:
-        return None
-    return -altitude if gps.get(GPS.GPSAltitudeRef) in BELOW_ZERO else altitude
 
 
 def _focal_length(details: dict[int, Any], width: int, height: int) -> float | None:
@@ -164,39 +216,13 @@ def _focal_length(details: dict[int, Any], width: int, height: int) -> float | N
     )
 
 
-def _camera(main: dict[int, Any], details: dict[int, Any]) -> str | None:
-    texts = [main.get(Base.Make), main.get(Base.Model), details.get(Base.BodySerialNumber)]
-    known = [text.strip("\0 ") for text in texts if isinstance(text, str)]
-    return " ".join(filter(None, known)) or None
-
-
-def _gps_time(gps: dict[int, Any]) -> datetime | None:
-    """Return the GPS time, which is UTC."""
-    day, clock = gps.get(GPS.GPSDateStamp), gps.get(GPS.GPSTimeStamp)
-    if not (isinstance(day, str) and isinstance(clock, tuple) and len(clock) == 3):
-        return None
-    parts = [_number(part) for part in clock]
-    if any(part is None for part in parts):
-        return None
-    hours, minutes, seconds = (part or 0.0 for part in parts)
-    try:
-        midnight = datetime.strptime(day.strip("\0 "), "%Y:%m:%d").replace(tzinfo=UTC)
-        return midnight + timedelta(hours=hours, minutes=minutes, seconds=seconds)
-    except (ValueError, OverflowError):
-        return None
-
-
-def _clock_time(details: dict[int, Any]) -> tuple[datetime | None, bool]:
-    """Return the time of the camera's clock (UTC without an offset), and if it has an offset."""
-    taken = details.get(Base.DateTimeOriginal)
-    offset = details.get(Base.OffsetTimeOriginal)
-    if not isinstance(taken, str):
-        return None, False
-    try:
-        local = datetime.strptime(taken.strip("\0 "), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
-        if isinstance(offset, str) and offset.strip("\0 "):
-            zone = datetime.fromisoformat(f"2000-01-01T00:00:00{offset.strip(chr(0) + ' ')}").tzinfo
-            return local.replace(tzinfo=zone or UTC).astimezone(UTC), zone is not None
-        return local, False
-    except (ValueError, OverflowError):
-        return None, False
+def _camera(main: dict[int, Any], details: dict[int, Any]) -> tuple[str | None, bool]:
+    """Return the camera's name, and whether it tells the camera from others of its model."""
+    names, own = (
+        [text.strip("\0 ") for text in texts if isinstance(text, str) and text.strip("\0 ")]
+        for texts in (
+            (main.get(Base.Make), main.get(Base.Model)),
+            (details.get(Base.CameraOwnerName), details.get(Base.BodySerialNumber)),
+        )
+    )
+    return " ".join(names + own) or None, any(text.strip("0") for text in own)

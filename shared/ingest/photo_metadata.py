@@ -18,11 +18,12 @@ from datetime import UTC, datetime
 from typing import Any
 
 from shared.catalog.photo_role import PhotoRole
-from shared.errors import InvalidRequest, PlacewiseError, TooLarge, invalid_field_error
-from shared.imaging.photo_header import MAX_ALTITUDE_M
+from shared.errors import InvalidRequest, PlacewiseError, TooLarge, invalid_field_error, shorten
+from shared.imaging.capture_place import MAX_ALTITUDE_M, is_null_island
 
 MAX_TAGS = 50
 MAX_METADATA_CHARACTERS = 100_000
+MAX_METADATA_FIELDS = 10_000  # at the top level
 MAX_METADATA_DEPTH = 32  # serialising a response fails at 255 levels
 MAX_TEXT_CHARACTERS = 500  # characters of a tag or a place
 MAX_PATH_CHARACTERS = 1000
@@ -65,9 +66,12 @@ def read_form_fields(form: dict[str, str]) -> PhotoFields:
                 name, f"is unknown; the known fields are {', '.join(FORM_FIELDS)}"
             )
     values = {name: value.strip() for name, value in form.items() if value.strip()}
-    fields = PhotoFields(
-        latitude=_number(values, "latitude", -90, 90),
-        longitude=_number(values, "longitude", -180, 180),
+    latitude, longitude = coordinate_pair(
+        _number(values, "latitude", -90, 90), _number(values, "longitude", -180, 180)
+    )
+    return PhotoFields(
+        latitude=latitude,
+        longitude=longitude,
         altitude=_number(values, "altitude", -MAX_ALTITUDE_M, MAX_ALTITUDE_M),
         heading=_heading(values),
         captured_at=parse_time("captured_at", values["captured_at"])
@@ -79,17 +83,24 @@ def read_form_fields(form: dict[str, str]) -> PhotoFields:
         role=_role(values["role"]) if "role" in values else None,
         relative_path=parse_relative_path(values.get("relative_path", "")),
     )
-    check_coordinate_pair(fields.latitude, fields.longitude)
-    return fields
 
 
-def check_coordinate_pair(latitude: float | None, longitude: float | None) -> None:
-    """Raise Unprocessable (`invalid_field`) where only one coordinate is set."""
+def coordinate_pair(
+    latitude: float | None, longitude: float | None
+) -> tuple[float | None, float | None]:
+    """Return both coordinates; 0, 0 are none, since receivers without a fix write them.
+
+    Raises:
+        Unprocessable: `invalid_field` where only one is set.
+    """
     if (latitude is None) != (longitude is None):
         missing = "latitude" if latitude is None else "longitude"
         raise invalid_field_error(
             missing, "is missing: set both latitude and longitude, or neither"
         )
+    if latitude is None or longitude is None or is_null_island(latitude, longitude):
+        return None, None
+    return latitude, longitude
 
 
 def parse_time(field: str, text: str) -> datetime:
@@ -232,7 +243,9 @@ NAME_COLUMNS = ("filename", "file", "path")
 CSV_COLUMNS = ("latitude", "longitude", "altitude", "heading", "captured_at", "place", "tags")
 KEY_FIELD = "key"  # in a manifest of objects to import
 FORMULA = re.compile("'*[=+@\\t\\r-]")  # such a cell is a formula in a spreadsheet, or was escaped
+MAX_LINE_BYTES = 1_000_000  # of a manifest: metadata with each character escaped
 MAX_REPORTED_LINES = 20  # bad lines in an error message
+MAX_FAULT_CHARACTERS = 500
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,12 +322,15 @@ def read_csv_manifest(data: bytes, source_name: str) -> list[ManifestEntry]:
 
 
 def read_jsonl_manifest(
-    data: bytes, source_name: str, name_fields: Sequence[str] = NAME_COLUMNS
+    data: bytes,
+    source_name: str,
+    name_fields: Sequence[str] = NAME_COLUMNS,
+    max_entries: int | None = None,
 ) -> list[ManifestEntry]:
     """Parse a JSONL manifest: objects with a name and any of the upload form's fields.
 
     `tags` may be a list, `metadata` an object. Empty lines are skipped. Errors name the manifest
-    `source_name`.
+    `source_name`. Of a manifest with more than `max_entries`, one more than that are returned.
 
     Raises:
         InvalidRequest: `bad_manifest`, with the first MAX_REPORTED_LINES bad lines.
@@ -332,7 +348,7 @@ def read_jsonl_manifest(
                 bad.append((number, f"{entry.name!r} is already in line {seen[entry.name]}"))
             seen.setdefault(entry.name, number)
             entries.append(entry)
-        if len(bad) == MAX_REPORTED_LINES:
+        if len(bad) == MAX_REPORTED_LINES or len(entries) - 1 == max_entries:
             break
     if bad:
         raise bad_lines_error("bad_manifest", source_name, bad)
@@ -343,6 +359,7 @@ def bad_lines_error(
     code: str, source_name: str, lines: Sequence[tuple[int, str]]
 ) -> PlacewiseError:
     """Return the error for bad lines of a manifest: (line number from 1, detail)."""
+    lines = [(line, shorten(detail, MAX_FAULT_CHARACTERS)) for line, detail in lines]
     return InvalidRequest(
         code,
         "; ".join(f"{source_name}, line {line}: {detail}" for line, detail in lines) + ".",
@@ -358,6 +375,8 @@ def _lines(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 def _parse_line(number: int, line: bytes, name_fields: Sequence[str]) -> ManifestEntry:
     """Parse one line; ValueError with the reason for a bad one."""
+    if len(line) > MAX_LINE_BYTES:
+        raise ValueError(f"has more than {MAX_LINE_BYTES} bytes")
     try:
         values = json.loads(line)
     except (ValueError, RecursionError):

@@ -21,8 +21,9 @@ from sqlalchemy.orm import Session
 
 from shared.catalog.api_keys import count_photos_of_key
 from shared.catalog.database.session import Catalog
-from shared.catalog.maps import Map, get_map
-from shared.catalog.photos import Photo, PhotoRole, find_photo_by_sha256
+from shared.catalog.jobs import UNFINISHED_STATES
+from shared.catalog.maps import Map, get_map, increment_map_version, lock_map
+from shared.catalog.photos import Photo, PhotoRole, find_same_photo
 from shared.errors import Conflict, TooManyRequests
 from shared.ids import new_id
 from shared.ingest.photo_metadata import PhotoFields
@@ -31,6 +32,8 @@ from shared.jobs import Job, JobKind, JobState, Priority
 from shared.jobs.transitions import requeue_job_as_new
 
 COORDINATE_TOLERANCE_DEGREES = 1e-7  # about a centimetre
+METADATA_OF_FILES = ("latitude", "longitude", "altitude", "heading", "captured_at", "focal_length")
+FILE_COLUMNS = ("sha256", "object_key", "filename", "size_bytes")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +44,13 @@ class StoreResult:
     job: Job | None
     queued: bool
     """Whether the job was queued, so that extractors are to be woken after the commit."""
+    already_there: bool
+    """Whether the map had the picture."""
+    updated: tuple[str, ...] = ()
+    """Values of a photo of the map that the new metadata of its file has set"""
+    unused_key: str | None = None
+    """Object to delete after the commit: the received bytes of a photo of the map, or the file that
+    they replace"""
 
 
 def insert_photo(
@@ -49,23 +59,29 @@ def insert_photo(
     incoming: ValidatedPhoto,
     priority: Priority = Priority.UPLOAD,
 ) -> StoreResult:
-    """Insert the rows of a photo and its job, or return the map's photo with the same bytes.
+    """Insert the rows of a photo and its job, or return the map's photo with the same picture.
+
+    A file of that picture with new metadata replaces the photo's file, and updates its values.
 
     Args:
         map_: id of the map, or the name of a live one.
 
     Raises:
         NotFound: `map_not_found`.
-        Conflict: `photo_differs` when the same image exists with different metadata.
+        Conflict: `photo_differs` when the photo exists and the sent fields differ from its values.
     """
     values = _photo_values(incoming)
     dialect = session.get_bind().dialect.name
     statement = _insert_statement(dialect, tuple(values), isinstance(map_, str))
     while (row := session.execute(statement, {**values, "map_": map_}).one_or_none()) is None:
         map_id = get_map(session, map_).id if isinstance(map_, str) else map_
-        existing = find_photo_by_sha256(session, map_id, incoming.received.sha256)
-        if existing is not None:
-            return _match_existing_photo(session, existing, incoming.fields)
+        existing = find_same_photo(
+            session, map_id, incoming.received.sha256, incoming.picture_sha256
+        )
+        if existing is not None and (
+            result := _match_existing_photo(session, existing, incoming, values)
+        ):
+            return result
         # PostgreSQL: the photo with the same bytes was deleted after the INSERT had seen it.
     photo = Photo(**values, map_id=row.map_id, uploaded_at=row.uploaded_at)
     job_values = {
@@ -77,7 +93,7 @@ def insert_photo(
         "photo_id": photo.id,
     }
     session.execute(_INSERT_JOB, job_values)
-    return StoreResult(photo, Job(**job_values), queued=True)
+    return StoreResult(photo, Job(**job_values), queued=True, already_there=False)
 
 
 def _photo_values(incoming: ValidatedPhoto) -> dict[str, Any]:
@@ -87,6 +103,7 @@ def _photo_values(incoming: ValidatedPhoto) -> dict[str, Any]:
         "id": new_id(),
         "job_id": new_id(),
         "sha256": received.sha256,
+        "picture_sha256": incoming.picture_sha256,
         "object_key": received.key,
         "filename": received.filename,
         "relative_path": fields.relative_path,
@@ -114,7 +131,7 @@ _INSERT_JOB = insert(cast(Table, Job.__table__))
 
 @functools.cache
 def _insert_statement(dialect: str, names: tuple[str, ...], by_name: bool) -> Executable:
-    """Return the insert of a photo into the map `map_`, unless that has the same bytes."""
+    """Return the insert of a photo into the map `map_`, unless that has the same picture."""
     columns = {name: Photo.__mapper__.columns[name] for name in names}
     values = [bindparam(name, type_=column.type) for name, column in columns.items()]
     is_map = Map.id == bindparam("map_")
@@ -125,15 +142,16 @@ def _insert_statement(dialect: str, names: tuple[str, ...], by_name: bool) -> Ex
     return (
         insert_into(table)
         .from_select([*columns.values(), table.c.map_id], select(*values, Map.id).where(is_map))
-        .on_conflict_do_nothing(
-            index_elements=[table.c.map_id, table.c.sha256], index_where=Photo.deleted_at.is_(None)
-        )
+        .on_conflict_do_nothing()
         .returning(table.c.map_id, table.c.uploaded_at)
     )
 
 
-def _match_existing_photo(session: Session, photo: Photo, fields: PhotoFields) -> StoreResult:
-    differing = _differing_fields(photo, fields)
+def _match_existing_photo(
+    session: Session, photo: Photo, incoming: ValidatedPhoto, values: dict[str, Any]
+) -> StoreResult | None:
+    """Return the photo, updated by new metadata of its file; None if it was deleted meanwhile."""
+    differing = _differing_fields(photo, incoming.fields)
     if differing:
         raise Conflict(
             "photo_differs",
@@ -144,12 +162,35 @@ def _match_existing_photo(session: Session, photo: Photo, fields: PhotoFields) -
             differing=differing,
         )
     if photo.relative_path is None:  # stored before paths were kept, or uploaded without its folder
-        photo.relative_path = fields.relative_path
+        photo.relative_path = incoming.fields.relative_path
     job = session.get(Job, photo.job_id, with_for_update=True) if photo.job_id else None
-    if job is not None and job.state in (JobState.FAILED, JobState.CANCELLED):
+    unused_key = incoming.received.key
+    updated: tuple[str, ...] = ()
+    if photo.sha256 != incoming.received.sha256:  # the same picture with other metadata
+        updated = tuple(
+            name
+            for name in METADATA_OF_FILES
+            if values[name] is not None and not _values_match(values[name], getattr(photo, name))
+        )
+    if updated:
+        lock_map(session, photo.map_id)
+        session.refresh(photo)
+        if photo.deleted_at is not None:
+            return None
+        for name in updated:
+            setattr(photo, name, values[name])
+        # An extractor may be reading the present file; the next upload replaces it.
+        if job is None or job.state not in UNFINISHED_STATES:
+            unused_key = photo.object_key
+            for name in FILE_COLUMNS:
+                setattr(photo, name, values[name])
+        photo.changed_version = increment_map_version(session, photo.map_id)
+    queued = job is not None and job.state in (JobState.FAILED, JobState.CANCELLED)
+    if job is not None and queued:
         requeue_job_as_new(job)
-        return StoreResult(photo, job, queued=True)
-    return StoreResult(photo, job, queued=False)
+    # A worker that stores its own object again finds it under the photo's key.
+    unused = None if photo.object_key == unused_key else unused_key
+    return StoreResult(photo, job, queued, True, updated, unused)
 
 
 def _differing_fields(photo: Photo, fields: PhotoFields) -> list[str]:

@@ -149,6 +149,8 @@ class ValidatedPhoto:
     fields: PhotoFields
     key_id: UUID | None = None
     """The API key of the upload."""
+    picture_sha256: str | None = None
+    """Hash of path and picture without metadata; None if the picture's bytes are unknown."""
 
 
 def validate_photo(
@@ -171,4 +173,6 @@ def validate_photo(
     fields = fields or read_form_fields(upload.fields)
     with upload.open(store) as file:
         header = read_photo_header(file, max_pixels)
-    return ValidatedPhoto(upload, media_type, header, fields, key_id)
+        path = fields.relative_path or upload.filename
+        picture_sha256 = header.picture.sha256(file, path) if header.picture else None
+    return ValidatedPhoto(upload, media_type, header, fields, key_id, picture_sha256)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from uuid import UUID
 
@@ -92,6 +93,17 @@ def claim_jobs(
         .execution_options(populate_existing=True)
     ).all()
     return batch
+
+
+def fair_batch_size(waiting: int, workers: int, limit: int) -> int:
+    """Return how many jobs a worker claims, so that the workers share a burst.
+
+    Each takes half of its share of what waits (guided self-scheduling), at least an eighth of
+    `limit`: a worker that claims first leaves enough for those that come a moment later.
+    """
+    if workers < 2:
+        return limit
+    return min(limit, max(math.ceil(waiting / (2 * workers)), limit // 8, 1))
 
 
 def has_claimable_jobs(

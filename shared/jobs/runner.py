@@ -25,8 +25,9 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, TypeVar
 from uuid import UUID
@@ -36,16 +37,17 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from shared.catalog.batch_items import has_batch_items
-from shared.catalog.database.base import db_now
+from shared.catalog.database.base import count_rows, db_now
 from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.session import IDLE_SECONDS, Catalog, ChangePoll
-from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState
+from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState, claimable_condition
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, Unavailable
 from shared.jobs.claim import claim_jobs, has_claimable_jobs
 from shared.jobs.leases import get_lease_token, lock_leased_jobs, maintain_lease
 from shared.jobs.model_changes import abandon_generation
 from shared.jobs.transitions import cancel_batch_items, fail_job, requeue_job
+from shared.jobs.wakeups import Wakeups, read_job_messages, report_jobs
 from shared.telemetry.tracing import request_id_context, span
 
 log = logging.getLogger(__name__)
@@ -78,8 +80,8 @@ class ClaimedJobs:
 
     jobs: list[Job]
     lease: contextlib.ExitStack
-    failed: int = 0
-    """Number of jobs that a step has failed because of a PlacewiseError."""
+    reasons: Counter[str] = field(default_factory=Counter)
+    """Number of jobs that failed, by the code of the error."""
 
     @property
     def token(self) -> UUID:
@@ -100,6 +102,7 @@ class JobRunner:
         worker: Name of the worker, stored with its jobs.
         kinds: Kinds of jobs that the worker runs.
         on_outcome: Called with kind, outcome and number of jobs after each step, for metrics.
+        wakeups: Tells monitors what becomes of the jobs.
     """
 
     catalog: Catalog
@@ -107,6 +110,7 @@ class JobRunner:
     worker: str
     kinds: Sequence[JobKind]
     on_outcome: Callable[[JobKind, StepOutcome, int], object]
+    wakeups: Wakeups | None = None
 
     def __post_init__(self) -> None:
         self._outage = OutageLog(f"worker {self.worker}")
@@ -168,15 +172,34 @@ class JobRunner:
         if claimed is None:
             return False
         job = claimed.jobs[0]
+        self.report_started(claimed)
         with claimed.lease, self.step(claimed, job.kind):
             handler(job)
             log.info("step of %s job: done", job.kind, extra={"job_id": str(job.id)})
+        self.report_ended(claimed)
         return True
+
+    def report_started(self, claimed: ClaimedJobs) -> None:
+        """Tell monitors that the jobs run."""
+        if self.wakeups is not None:
+            self.wakeups.started(*claimed.jobs)
+
+    def report_ended(self, claimed: ClaimedJobs) -> None:
+        """Tell monitors what has become of the jobs."""
+        if self.wakeups is not None:
+            with contextlib.suppress(SQLAlchemyError):  # what is told is committed already
+                report_jobs(self.catalog, self.wakeups, [job.id for job in claimed.jobs])
 
     def has_jobs(self, min_priority: int | None = None, *, alone: bool = True) -> bool:
         """Return whether `claim` with the same arguments would find a job."""
         with self.catalog.read() as session:
             return has_claimable_jobs(session, self.kinds, min_priority, alone=alone)
+
+    def count_waiting(self, limit: int) -> int:
+        """Count the jobs that `claim` could claim, up to `limit`."""
+        waiting = select(Job.id).where(claimable_condition(self.kinds))
+        with self.catalog.read() as session:
+            return count_rows(session, waiting, limit)
 
     def claim(
         self,
@@ -199,8 +222,12 @@ class JobRunner:
                 alone=alone,
                 started=started,
             )
+            ids = [job.id for job in jobs]
+            messages = read_job_messages(session, ids) if self.wakeups and jobs else []
         if not jobs:
             return None
+        if self.wakeups is not None:
+            self.wakeups.claimed(*messages)
         claimed = ClaimedJobs(jobs, contextlib.ExitStack())
         claimed.lease.enter_context(maintain_lease(self.catalog, claimed.token, lease_seconds))
         return claimed
@@ -209,6 +236,7 @@ class JobRunner:
         """Return the jobs to the queue because the worker stops, without counting an attempt."""
         self._update(claimed, lambda _session, job: requeue_job(job))
         self.on_outcome(claimed.kind, StepOutcome.INTERRUPTED, len(claimed.jobs))
+        self.report_ended(claimed)
 
     @contextlib.contextmanager
     def step(self, claimed: ClaimedJobs, name: str) -> Iterator[None]:
@@ -235,11 +263,12 @@ class JobRunner:
                 )
             except PlacewiseError as error:
                 outcome, refusal = StepOutcome.FAILED, error.as_problem()
-                log.error("%s: %s", jobs, error.detail)
+                log.error("%s: %s: %s", jobs, error.code, error.detail)
                 updated = self._update(
                     claimed, lambda session, job: _fail_or_requeue(session, job, refusal)
                 )
-                claimed.failed = sum(job.state == JobState.FAILED for job in updated)
+                failed = sum(job.state == JobState.FAILED for job in updated)
+                claimed.reasons[error.code] += failed
             except Exception as error:
                 outcome, event = StepOutcome.CRASHED, f"crashed ({type(error).__name__})"
                 log.exception("%s: crashed", jobs)
@@ -260,7 +289,7 @@ class JobRunner:
         return jobs
 
 
-def reclaim_expired_leases(session: Session, *, all_leases: bool = False) -> int:
+def reclaim_expired_leases(session: Session, *, all_leases: bool = False) -> list[Job]:
     """Return the jobs of dead workers to the queue, or fail them after MAX_ATTEMPTS.
 
     Args:
@@ -269,7 +298,7 @@ def reclaim_expired_leases(session: Session, *, all_leases: bool = False) -> int
             other worker runs.
 
     Returns:
-        The number of jobs reclaimed.
+        The jobs that were reclaimed.
     """
     expired = select(Job).where(Job.lease_token.is_not(None))
     if not all_leases:
@@ -277,7 +306,7 @@ def reclaim_expired_leases(session: Session, *, all_leases: bool = False) -> int
     jobs = session.scalars(expired.order_by(Job.id).with_for_update(skip_locked=True)).all()
     for job in jobs:
         _requeue_after_crash(session, job, job.claimed_together, "died")
-    return len(jobs)
+    return list(jobs)
 
 
 def _requeue_after_crash(session: Session, job: Job, together: int, event: str) -> None:

@@ -72,9 +72,9 @@ def merge_responses(
 
 
 def _top_hits(k: int, responses: Sequence[SearchResponse]) -> list[SearchHit]:
-    """The best `k` hits of responses that are sorted each: by `ranked_by`, ties by photo id."""
+    """The best `k` hits of responses that are sorted each: by `score`, ties by photo id."""
     merged = heapq.merge(
-        *(response.hits for response in responses), key=lambda hit: (-hit.ranked_by, hit.photo_id)
+        *(response.hits for response in responses), key=lambda hit: (-hit.score, hit.photo_id)
     )
     hits: dict[UUID, SearchHit] = {}
     for hit in merged:
@@ -105,6 +105,7 @@ def merge_statuses(
         versions={key: min(status.versions[key] for status in statuses) for key in common},
         incomplete=tuple(sorted({key for status in statuses for key in status.incomplete})),
         missing=tuple(key for status in statuses for key in status.missing),
+        disk_full=any(status.disk_full for status in statuses),
         lags={
             key: max(
                 (status.lags[key] for status in statuses if key in status.lags),
@@ -112,7 +113,6 @@ def merge_statuses(
             )
             for key in lagging
         },
-        devices=tuple(device for status in statuses for device in status.devices),
         unavailable=tuple(shard.name for shard in sorted(unreachable)),
     )
 

@@ -54,10 +54,6 @@ class SearchRequest(_Message):
     deletion the caller has seen is taken into account. `exclude` names photos to leave out of the
     result, usually the query itself.
 
-    `word_weights`, one for each word of the generation's vocabulary, multiply the words of the
-    query, and rows are ranked by the similarity to that weighted query; `min_score` still applies
-    to the plain cosine. The weights are sent by value, so that all shards rank by the same ones.
-
     The mean of the rows of `background` is subtracted from the query first
     (`shared.search_api.background`); scores are the cosines to what is left. Rows that no longer
     exist are left out of the mean.
@@ -75,7 +71,6 @@ class SearchRequest(_Message):
     min_score: float | None = None
     exclude: tuple[UUID, ...] = ()
     mode: Mode = Mode.AUTO
-    word_weights: tuple[float, ...] = ()
     background: tuple[RowReference, ...] = ()
 
 
@@ -85,18 +80,10 @@ class SearchHit(_Message):
     photo_id: UUID
     score: float
     """Cosine similarity in [-1, 1]."""
-    weighted_score: float | None = None
-    """Cosine similarity to the weighted query; None for a plain ranking: without weights, or where
-    no word of the query has a weight."""
-
-    @property
-    def ranked_by(self) -> float:
-        """The score that determines the order."""
-        return self.score if self.weighted_score is None else self.weighted_score
 
 
 class SearchResponse(_Message):
-    """Result of a search: `hits` sorted by `SearchHit.ranked_by` descending, ties by photo id."""
+    """Result of a search: `hits` sorted by `score` descending, ties by photo id."""
 
     hits: tuple[SearchHit, ...]
     certificate: str
@@ -139,18 +126,6 @@ class LoadedGeneration(_Message):
     parts: tuple[IndexPart, ...]
 
 
-class DeviceStatus(_Message):
-    """A GPU that a worker searches on."""
-
-    name: str
-    resident_bytes: int
-    """Bytes of descriptors in the GPU's memory."""
-    generations: tuple[UUID, ...]
-    """Generations searched on the GPU; the others are searched on the CPU."""
-    failure: str | None = None
-    """Last error, after which the CPU searches until the next attempt; None if there is none."""
-
-
 class SearchStatus(_Message):
     """State of a worker: rows and bytes in memory, and the loaded version of each generation.
 
@@ -169,10 +144,10 @@ class SearchStatus(_Message):
     """Generations with an unreadable chunk."""
     missing: tuple[str, ...]
     """Object keys of unreadable chunks."""
+    disk_full: bool = False
+    """Whether some are unreadable only because a worker's cache is on a full disk."""
     lags: dict[UUID, ReplicationLag] = {}
     """Replication lag by generation; empty for a worker that does not follow the catalog."""
-    devices: tuple[DeviceStatus, ...] = ()
-    """GPUs in use; empty where the CPU searches everything."""
     unavailable: tuple[str, ...] = ()
     """Shards without an answering worker, as `SearchResponse.missing` names them."""
 
@@ -272,6 +247,10 @@ class PoseRequest(_Message):
     camera_source: str
     """where `focal_length` comes from: a `shared.geometry.cameras.CameraSource`. A focal length of
     EXIF that a candidate has, too, is that of its camera, which was refined with the model"""
+    camera_key: str | None = None
+    """`PhotoHeader.camera_key` of the query"""
+    quarter_turns: int = 0
+    """clockwise, by which the query was turned upright"""
     leave_out: tuple[UUID, ...] = ()
     """photos whose own points are not used: the query, if it is one of the map"""
 

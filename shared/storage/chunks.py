@@ -173,7 +173,7 @@ def write_chunk(
     }
     written = WrittenChunk(object_key=key, rows=len(rows), size_bytes=len(data), sha256=sha256)
     if features and any(feature_rows):
-        feature_file = encode_feature_file(features)
+        feature_file = encode_feature_file(features, features_key(key))
         written = replace(
             written,
             features_model=features.model,

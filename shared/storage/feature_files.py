@@ -3,12 +3,12 @@
 `<chunk>.features` is, in this order:
 
     the bytes PWF1, and the length of the header as a little-endian uint32
-    the header, JSON: {"format": 1, "model": "xfeat@...", "rows": n}
+    the header, JSON: {"format": 1, "model": "xfeat@...", "rows": n, "name": "<chunk>.features"}
     n + 1 little-endian uint64: where each row begins, from the start of the file
     the rows, each as `LocalFeatures.encode` writes it
 
 Row i has the features of the photo of row i of the chunk; it is empty where none were computed.
-Rows are read by range.
+Rows are read by range. The name tells a file that was put in the place of another one.
 """
 
 from __future__ import annotations
@@ -66,15 +66,16 @@ class FeatureRows:
     """encoded features by row; empty for photos without"""
 
 
-def encode_feature_file(features: FeatureRows) -> bytes:
-    """Encode a feature file."""
-    index = encode_feature_index(features.model, list(map(len, features.rows)))
+def encode_feature_file(features: FeatureRows, key: str) -> bytes:
+    """Encode a feature file that will be stored as `key`."""
+    index = encode_feature_index(features.model, list(map(len, features.rows)), key)
     return b"".join([index, *features.rows])
 
 
-def encode_feature_index(model: str, sizes: Sequence[int]) -> bytes:
+def encode_feature_index(model: str, sizes: Sequence[int], key: str) -> bytes:
     """Encode the start of a feature file whose rows have these sizes in bytes."""
-    header = json.dumps({"format": 1, "model": model, "rows": len(sizes)}).encode()
+    name = key.rpartition("/")[2]
+    header = json.dumps({"format": 1, "model": model, "rows": len(sizes), "name": name}).encode()
     start = _START.pack(MAGIC, len(header)) + header
     offsets = np.cumsum([len(start) + 8 * (len(sizes) + 1), *sizes])
     return start + offsets.astype("<u8").tobytes()
@@ -99,8 +100,11 @@ def _read_index(file: BinaryIO, key: str) -> FeatureIndex:
     try:
         header = json.loads(read_up_to(file, size))
         model, rows = str(header["model"]), int(header["rows"])
+        name = header["name"]
     except (KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"the header of {key} is damaged") from error
+    if name != key.rpartition("/")[2]:
+        raise ValueError(f"{key} has the content of {name!r:.100}")
     offsets = np.frombuffer(read_up_to(file, 8 * (min(rows, MAX_ROWS) + 1)), "<u8")
     sizes = np.diff(offsets.astype(np.int64))
     if len(sizes) != rows or ((sizes < 0) | (sizes > MAX_ROW_BYTES)).any():

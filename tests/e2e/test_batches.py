@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -182,27 +181,6 @@ def test_export_writes_what_other_programs_read(server: ServerProcess, tmp_path:
     lines = (tmp_path / "pairs.txt").read_text().splitlines()
     assert len(lines) == pairs["pairs"] > 0
     assert all(len(set(line.split())) == 2 for line in lines)
-
-
-def test_a_batch_goes_on_after_each_kill_and_brings_each_photo_in_once(tmp_path: Path) -> None:
-    count = 120
-    with ServerProcess(tmp_path / "home", batch_photos=1) as server:
-        answer = server.client.post("/api/v1/upload/batch", files=form(*range(count)))
-        job_url = f"/api/v1/jobs/{answer.json()['job_id']}"
-        for reached in (10, 40, 80):
-            while server.client.get(job_url).json()["progress"]["done"] < reached:
-                time.sleep(0.01)
-            server.kill()
-            server.start()
-        job = server.finished(answer.json()["job_id"])
-        assert job["state"] == "succeeded", job
-        assert job["progress"] == {"done": count, "total": count, "failed": 0}
-        assert job["result"]["already_there"] == 0, "none was brought in a second time"
-        stats = server.client.get("/api/v1/database/stats").json()
-        assert (stats["total_images"], stats["searchable_images"]) == (count, count)
-        originals = server.home / "objects" / "originals"
-        # A kill may leave one that is being written; the steward removes it after a day.
-        assert count <= len([p for p in originals.iterdir() if p.is_file()]) <= count + 3
 
 
 def test_a_batch_in_separate_services_outlives_its_steward(

@@ -105,7 +105,7 @@ def test_index_fits_a_vocabulary_from_fifty_photos_on(indexed: Indexed) -> None:
     assert report["failed"][0]["reason"]
 
 
-def test_index_run_again_has_nothing_to_do(indexed: Indexed) -> None:
+def test_indexing_again_uploads_nothing(indexed: Indexed) -> None:
     again = indexed.without_the_broken
     assert again.code == 0, again.stderr
     assert f"{PHOTOS} photos processed, {PHOTOS} already stored" in again.stderr
@@ -261,7 +261,7 @@ def test_an_extractor_that_can_not_start_ends_only_what_needs_it(tmp_path: Path)
     assert "Traceback" not in served.stderr
 
 
-def test_config_shows_what_is_in_force_and_no_secret(tmp_path: Path) -> None:
+def test_config_shows_effective_settings_and_no_secret(tmp_path: Path) -> None:
     secret = "postgresql+psycopg://user:hidden-word@db.example/places"
     command = CommandLine(tmp_path, tmp_path / "home", database_url=secret, max_file_size=12345)
     as_json, as_table = command("config", "--json"), command("config")

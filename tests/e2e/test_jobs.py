@@ -15,7 +15,7 @@ import pytest
 
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
-from tests.support.server import ServerProcess
+from tests.support.server import ServerProcess, environment, run_command
 
 # One photo per batch, so that of several photos only the first ones are under way.
 SETTINGS = {"batch_photos": 1}
@@ -41,15 +41,6 @@ def failed_job(server: ServerProcess) -> str:
     return job_id
 
 
-def queued_job(server: ServerProcess) -> dict[str, Any]:
-    """The upload of a photo whose job is queued behind others; inside `no_decoding`."""
-    for _ in range(3):  # one is described, one prepared, one more for good measure
-        server.upload(photo_bytes(next(fresh)))
-    uploaded: dict[str, Any] = server.upload(photo_bytes(next(fresh))).json()
-    assert get(server, uploaded["status_url"])["state"] == "queued"
-    return uploaded
-
-
 def post(server: ServerProcess, job_id: str, verb: str) -> httpx2.Response:
     return server.client.post(f"{JOBS}/{job_id}/{verb}")
 
@@ -65,6 +56,33 @@ def test_a_job_has_its_times_progress_and_result(server: ServerProcess) -> None:
     assert job["error"] is None
     assert job["waiting_for"] is None
     assert job["created_at"] <= job["started_at"] <= job["finished_at"]
+
+
+def test_the_command_names_failed_photos_with_the_reason_and_retries_them(
+    server: ServerProcess,
+) -> None:
+    def jobs(*options: str) -> list[dict[str, Any]]:
+        ran = run_command(
+            "jobs", *options, "--json", env=environment(server.home), cwd=server.home.parent
+        )
+        assert ran.returncode == 0, ran.stderr
+        found: list[dict[str, Any]] = json.loads(ran.stdout)
+        return found
+
+    broken = server.upload(photo_bytes(next(fresh))[:-60], "cut-off.jpg").json()["job_id"]
+    assert server.finished(broken)["state"] == "failed"
+    failed = jobs("--failed")
+    assert {job["state"] for job in failed} == {"failed"}
+    assert (failed[0]["filename"], failed[0]["map"]) == ("cut-off.jpg", "default")
+    assert failed[0]["error"]["code"] == "undecodable_photo"
+    table = run_command("jobs", env=environment(server.home), cwd=server.home.parent).stdout
+    (row,) = [line for line in table.splitlines() if "cut-off.jpg" in line]
+    assert row.startswith("failed\tcut-off.jpg\tindex\t")
+    assert failed[0]["error"]["detail"] in row
+
+    (retried,) = jobs("--retry", "--limit", "1")
+    assert (retried["job_id"], retried["state"]) == (broken, "queued")
+    assert server.finished(broken)["state"] == "failed", "it is as broken as before"
 
 
 def test_jobs_are_listed_newest_first_by_state_and_kind_page_by_page(
@@ -172,9 +190,12 @@ def test_a_job_is_watched_until_its_final_state(server: ServerProcess) -> None:
     assert all(job["state"] in ("queued", "running") for job in jobs[:-1])
 
 
-def test_a_cancelled_job_stays_undone_until_it_is_retried(server: ServerProcess) -> None:
+def test_a_cancelled_job_runs_only_after_a_retry(server: ServerProcess) -> None:
     with server.no_decoding():
-        uploaded = queued_job(server)
+        for _ in range(3):  # one is described, one prepared, one more for good measure
+            server.upload(photo_bytes(next(fresh)))
+        uploaded = server.upload(photo_bytes(next(fresh))).json()
+        assert get(server, uploaded["status_url"])["state"] == "queued"
         answer = post(server, uploaded["job_id"], "cancel")
         assert answer.status_code == 200
         assert answer.json()["state"] == "cancelled"
@@ -216,11 +237,3 @@ def test_a_cancelled_query_has_no_result(server: ServerProcess) -> None:
         ).json()
         assert post(server, started["job_id"], "cancel").status_code == 200
         problem(server.client.get(started["result_url"]), 409, "job_cancelled")
-
-
-def test_the_job_of_a_deleted_photo_is_not_retried(server: ServerProcess) -> None:
-    with server.no_decoding():
-        uploaded = queued_job(server)
-        assert server.client.delete(f"/api/v1/uploads/{uploaded['file_id']}").status_code == 200
-        assert get(server, uploaded["status_url"])["state"] == "cancelled"
-        problem(post(server, uploaded["job_id"], "retry"), 409, "photo_deleted")

@@ -11,8 +11,13 @@ import pytest
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
-from services.cli.locate.sidecars import read_position
-from tests.support.photos import encoded, exif_with_position, photo_bytes, photo_image
+from tests.support.photos import (
+    encoded,
+    exif_with_position,
+    photo_bytes,
+    photo_image,
+    sidecar_position,
+)
 from tests.support.server import ServerProcess, environment, run_command
 
 NOON = datetime(2026, 5, 1, 12)  # noqa: DTZ001 the clock of a camera
@@ -73,7 +78,7 @@ def test_a_folder_is_located_by_the_map_and_by_time_written_and_undone(
     written = locate("--accept", "0.9", "--write", "sidecar")
     assert written.returncode == 0, written.stderr
     assert "of the map.jpg" in written.stdout
-    position = read_position((trip / "of the map.jpg.xmp").read_bytes())
+    position = sidecar_position((trip / "of the map.jpg.xmp").read_bytes())
     assert position == pytest.approx((by_both["position"]["latitude"], LONGITUDE), abs=1e-4)
     undone = locate("--undo")
     assert undone.returncode == 0, undone.stderr

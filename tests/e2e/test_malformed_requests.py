@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import pytest
 
+from tests.support.memory import memory_bytes
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess
 
@@ -75,3 +77,20 @@ def test_doctor_writes_nothing(tmp_path: Path) -> None:
     assert "can be created" in _check_home(settings)
     assert "nothing is stored" in _check_catalog_file(settings)
     assert not (tmp_path / "not").exists()
+
+
+@pytest.mark.parametrize("item", ["{}", "[]", "1", '""', '{"":0}'])
+def test_a_body_of_millions_of_items_is_refused_in_seconds_and_without_memory(
+    server: ServerProcess, item: str
+) -> None:
+    camera = '{"model":"PINHOLE","width":9,"height":9,"params":[9,9,4,4]}'
+    items = ",".join([item] * (12_000_000 // (len(item) + 1)))
+    started, before = time.monotonic(), memory_bytes("VmHWM", server.process.pid)
+    answer = server.client.post(
+        "/api/v1/reconstructions/import",
+        content=f'{{"cameras":[{camera}],"photos":[{items}]}}',
+        headers={"content-type": "application/json"},
+    )
+    assert (answer.status_code, answer.json()["code"]) == (413, "too_many_values")
+    assert time.monotonic() - started < 5
+    assert memory_bytes("VmHWM", server.process.pid) - before < 300_000_000

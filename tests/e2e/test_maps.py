@@ -125,7 +125,7 @@ def test_every_call_says_how_to_make_the_map_that_is_missing(server: ServerProce
 # --- each for itself -------------------------------------------------------------------------
 
 
-def test_searches_never_cross(server: ServerProcess) -> None:
+def test_searches_find_photos_of_their_map_alone(server: ServerProcess) -> None:
     one, other = make(server), make(server)
     numbers = [next(fresh) for _ in range(3)]
     here, there = store(server, one, *numbers), store(server, other, *numbers)
@@ -180,7 +180,7 @@ def test_what_belongs_to_one_map_is_not_found_in_another(server: ServerProcess) 
     assert (photo["place"], photo["searchable"]) == (None, True)
 
 
-def test_lists_and_figures_do_not_cross(server: ServerProcess) -> None:
+def test_lists_and_statistics_are_those_of_their_map(server: ServerProcess) -> None:
     one, other = make(server), make(server)
     (here, _) = store(server, one, next(fresh), next(fresh), place="hall")
     store(server, other, next(fresh))
@@ -204,37 +204,6 @@ def test_lists_and_figures_do_not_cross(server: ServerProcess) -> None:
     assert [s["total_images"] for s in stats] == [2, 1]
     assert [s["total_searches"] for s in stats] == [1, 0]
     assert [sum(s["jobs"].values()) for s in stats] == [3, 1]
-
-
-def test_a_fit_in_one_map_leaves_the_others_generation_alone(server: ServerProcess) -> None:
-    one, other = (make(server, extractor="test-tiny-vlad") for _ in range(2))
-    numbers = [next(fresh) for _ in range(3)]
-    for name in (one, other):
-        for number in numbers:
-            files = {"file": photo_bytes(number)}
-            got(server.client.post("/api/v1/upload", params={"map": name}, files=files), 202)
-
-    def fit(name: str, seed: int) -> str:
-        params = {"clusters": 4, "seed": seed}
-        answer = server.client.post("/api/v1/vocabularies", params={"map": name}, json=params)
-        job = ended(server, name, got(answer, 202)["job_id"])
-        assert job["state"] == "succeeded", job
-        generation: str = job["result"]["generation_id"]
-        return generation
-
-    def generation(name: str) -> Any:
-        return got(server.client.get(f"{MAPS}/{name}"))
-
-    fit(one, 0)
-    assert generation(other)["generation_id"] is None
-    assert generation(other)["searchable"] == 0
-    retained = fit(other, 0)
-    for seed in (1, 2):
-        fit(one, seed)
-    assert generation(other)["generation_id"] == retained
-    assert len(got(server.client.get("/api/v1/vocabularies", params={"map": other}))) == 1
-    assert len(got(server.client.get("/api/v1/generations", params={"map": one}))) == 3
-    assert generation(one)["searchable"] == generation(other)["searchable"] == 3
 
 
 # --- by command ------------------------------------------------------------------------------

@@ -66,7 +66,7 @@ def test_every_call_is_described_once(server: ServerProcess) -> None:
     }
 
 
-def test_figures_follow_what_is_done(server: ServerProcess) -> None:
+def test_statistics_follow_uploads_and_deletions(server: ServerProcess) -> None:
     before = got(server.client.get(f"{API}/database/stats"))
     made = server.indexed(photo_bytes(5000))
     after = got(server.client.get(f"{API}/database/stats"))
@@ -117,7 +117,7 @@ def refused_start(home: Path, **settings: Any) -> str:
     return ended.stderr
 
 
-def test_a_folder_has_one_server(server: ServerProcess, tmp_path: Path) -> None:
+def test_a_home_is_served_by_one_process(server: ServerProcess, tmp_path: Path) -> None:
     reported = refused_start(server.home)
     assert reported.startswith("home_in_use: ")
     assert str(server.client.base_url).rstrip("/") in reported
@@ -126,7 +126,7 @@ def test_a_folder_has_one_server(server: ServerProcess, tmp_path: Path) -> None:
     assert server_address_file(server.home).exists(), "and can still be found"
 
 
-def test_an_address_has_one_server(server: ServerProcess, tmp_path: Path) -> None:
+def test_an_address_in_use_is_refused(server: ServerProcess, tmp_path: Path) -> None:
     port = server.client.base_url.port
     reported = refused_start(tmp_path / "another", port=port)
     assert reported.startswith("address_in_use: ")
@@ -152,7 +152,7 @@ def test_settings_that_can_not_work_are_refused_at_the_start(
 # --- its end, and the next start -------------------------------------------------------------
 
 
-def test_a_stopped_server_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_a_restarted_server_resumes_its_jobs(tmp_path: Path) -> None:
     with ServerProcess(tmp_path / "home", batch_photos=1) as server:
         first = server.indexed(photo_bytes(1))
         with server.no_decoding():

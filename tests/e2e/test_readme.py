@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import httpx2
+import psutil
 import pytest
 
 from tests.support.photos import near_copy, photo_bytes
@@ -73,7 +74,11 @@ class RunningShell:
 
 @pytest.fixture(scope="module")
 def shell(place: Path) -> Iterator[RunningShell]:
-    """A shell with `make run`, from the repository, on a free port."""
+    """A shell with `make run`, from the repository, on a free port.
+
+    It ignores neither SIGINT nor SIGHUP, as it would inherit it from tests that a script runs in
+    the background or under `nohup`: there, a server outlives its shell.
+    """
     with socket.create_server(("127.0.0.1", 0)) as probe:
         free: int = probe.getsockname()[1]
     environment = _environment(place)
@@ -86,14 +91,13 @@ def shell(place: Path) -> Iterator[RunningShell]:
             stdout=log,
             stderr=log,
             start_new_session=True,
+            preexec_fn=_heed_signals,
         )
     try:
         deadline = time.monotonic() + 120
-        while True:
+        while not re.search(r"^  open: .+\n", (place / "run.log").read_text(), re.MULTILINE):
             assert process.poll() is None, (place / "run.log").read_text()
             assert time.monotonic() < deadline, (place / "run.log").read_text()
-            if _answers(free):
-                break
             time.sleep(0.1)
         yield RunningShell(process, free)
     finally:
@@ -160,19 +164,17 @@ def test_make_run_shows_the_address_last_and_ends_its_server_with_its_shell(
         r"^Placewise serves .+\n(?:  .+\n)+", (place / "run.log").read_text(), re.M
     )
     assert shown.endswith(f" http://127.0.0.1:{shell.port}\n")
+    started = psutil.Process(shell.process.pid).children(recursive=True)
+    assert any("serve" in process.cmdline() for process in started)
     shell.process.kill()
     shell.process.wait(timeout=60)
-    deadline = time.monotonic() + 120
-    while _answers(shell.port):
-        assert time.monotonic() < deadline, (place / "run.log").read_text()
-        time.sleep(0.1)
+    _, running = psutil.wait_procs(started, timeout=120)
+    assert not running, (place / "run.log").read_text()
 
 
-def _answers(port: int) -> bool:
-    try:
-        return httpx2.get(f"http://127.0.0.1:{port}/livez").is_success
-    except httpx2.TransportError:
-        return False
+def _heed_signals() -> None:
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
 
 
 def test_make_alone_lists_its_targets_and_knows_each() -> None:

@@ -11,7 +11,6 @@ import pytest
 from placewise.client import Client
 from shared.storage.s3 import Bucket, S3Store
 from tests.support.photos import photo_bytes
-from tests.support.problems import problem
 from tests.support.server import ServerProcess, environment, run_command
 from tests.support.servers import S3Server
 
@@ -71,12 +70,6 @@ def test_what_is_in_the_bucket_is_there_at_the_next_start(server: ServerProcess)
     assert server.client.get(f"/api/v1/uploads/{photo}/image").content == photo_bytes(10)
     found = server.ask(photo_bytes(10)).json()["similar_images"]
     assert found[0]["image_id"] == photo
-
-
-def test_refused_upload_leaves_nothing_in_the_bucket(server: ServerProcess, bucket: Bucket) -> None:
-    before = keys(bucket, "originals/")
-    problem(server.upload(b"\xff\xd8\xff" + bytes(50_000)), 422, "undecodable_photo")
-    assert keys(bucket, "originals/") == before
 
 
 def test_placewise_does_not_start_without_its_object_store(tmp_path: Path) -> None:

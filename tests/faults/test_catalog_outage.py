@@ -85,13 +85,13 @@ class Deployment:
         self.client = TestClient(
             create_app(gateway), base_url="http://localhost", raise_server_exceptions=False
         )
-        evaluator = EvaluationWorker(self.catalog, store, self.search, settings, "evaluator")
+        evaluator = EvaluationWorker(self.catalog, self.search, settings, "evaluator")
         self._stop = threading.Event()
         self._parts = start_service_threads(
             {
                 "search": self.search.run,
                 "presence": WorkerHeartbeat(self.catalog, self.search, "search").run,
-                "extractor": partial(self._extractor.run, wakeups=wakeups),
+                "extractor": partial(self._extractor.run, wait=wakeups.wait),
                 "steward": Scheduler(self.catalog, store, wakeups, settings).run,
                 "evaluator": evaluator.run,
             },

@@ -35,8 +35,9 @@ class Service:
     ) -> None:
         self.catalog, self.store, self.settings = catalog, store, settings
         self.search = SearchWorker(catalog, store, settings)
+        self.wakeups = InProcessWakeups()
         gateway = GatewayContext(
-            catalog, store, InProcessWakeups(), self.search, settings, LocalhostAuthenticator()
+            catalog, store, self.wakeups, self.search, settings, LocalhostAuthenticator()
         )
         self._app = create_app(gateway)
         self._client = TestClient(self._app, base_url="http://localhost")

@@ -75,9 +75,7 @@ class Town:
         return job.id
 
     def evaluator(self, search: SearchBackend | None = None) -> EvaluationWorker:
-        return EvaluationWorker(
-            self.catalog, self.store, search or self.search, Settings(), "evaluator"
-        )
+        return EvaluationWorker(self.catalog, search or self.search, Settings(), "evaluator")
 
     def work(
         self, search: SearchBackend | None = None, stop: threading.Event | None = None

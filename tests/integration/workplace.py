@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from sqlalchemy import select
 
-from services.extractor.handlers import DrainStats
 from services.extractor.worker import ExtractorWorker
 from services.steward.tasks.auto_fit import fit_due_vocabularies
 from services.steward.tasks.model_changes import advance_model_changes
@@ -105,13 +104,19 @@ class Workplace:
             self._worker = self.make_worker()
         return self._worker
 
-    def drain(self) -> DrainStats:
+    def drain(self) -> bool:
         """Do all jobs of the extractor, fits too; the result is that of the first drain."""
         stop = threading.Event()
         result = self.worker.drain(stop)
         while self.worker.fits.run_next(stop):
             self.worker.drain(stop)
         return result
+
+    def ended(self) -> tuple[int, int]:
+        """How many jobs have succeeded, and how many have failed."""
+        with self.catalog.read() as session:
+            states = session.scalars(select(Job.state)).all()
+        return states.count(JobState.SUCCEEDED), states.count(JobState.FAILED)
 
     def advance(self) -> None:
         advance_model_changes(self.catalog, self.wakeups, self._queued_chunks)

@@ -66,6 +66,7 @@ UPLOADED: dict[str, Any] = {
     "status": "queued",
     "status_url": "/",
     "already_there": False,
+    "updated": [],
     "message": "",
 }
 SIMILAR: dict[str, Any] = {
@@ -74,9 +75,8 @@ SIMILAR: dict[str, Any] = {
     "processing_time_ms": 1.0,
     "total_similar": 0,
     "similar_images": [],
-    "estimate": {"reason": "No match."},
+    "estimate": {"headline": "No match.", "reason": "No match."},
     "vocabulary": "own",
-    "word_weights": "none",
     "generation_id": GENERATION_ID,
     "certificate": "exhaustive",
     "rows_scanned": 0,

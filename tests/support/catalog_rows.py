@@ -40,7 +40,6 @@ PRIORITIES = {
     JobKind.REINDEX: Priority.REINDEX,
     JobKind.DESCRIBE: Priority.QUERY,
     JobKind.EVALUATE: Priority.EVALUATION,
-    JobKind.WORD_WEIGHTS: Priority.EVALUATION,
     **dict.fromkeys(
         (*MODEL_CHANGE_JOBS, JobKind.ADD_MODEL, JobKind.RECONSTRUCT), Priority.MODEL_CHANGE
     ),

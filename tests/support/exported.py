@@ -56,7 +56,13 @@ def onnx_of(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            module, (batch,), path, dynamic_shapes=shapes, external_data=external, verbose=False
+            module,
+            (batch,),
+            path,
+            dynamic_shapes=shapes,
+            external_data=external,
+            verbose=False,
+            dynamo=True,
         )
     return path.read_bytes()
 

@@ -29,8 +29,8 @@ from shared.config.settings import Settings
 # Beside the command's own modules: what they import when they run. A module that is missing here is
 # imported by each process that needs it.
 MODULES = (
-    "services.cli.descriptors.local_extractor",
-    "services.cli.descriptors.local_fit",
+    "lab.cli.descriptors.describe_files",
+    "lab.cli.descriptors.fits",
     "services.extractor.service",
     "services.gateway.app",
     "services.search.service",

@@ -43,7 +43,7 @@ def put_features(
 ) -> list[FeatureReference]:
     """Store a feature file of these photos; None is a row without features."""
     key = key or f"chunks/{new_id()}/{new_id()}.features"
-    store.put(key, encode_feature_file(feature_rows(*photos, model=model)))
+    store.put(key, encode_feature_file(feature_rows(*photos, model=model), key))
     return [FeatureReference(object_key=key, row=row) for row in range(len(photos))]
 
 

@@ -9,6 +9,9 @@ import numpy as np
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
+from shared.imaging.capture_place import read_place
+from shared.imaging.xmp import read_xmp
+
 UNDO_OF_ORIENTATION = {
     1: None,
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -65,3 +68,9 @@ def exif_with_position(latitude: float, longitude: float) -> Image.Exif:
         (abs(longitude), 0.0, 0.0),
     )
     return exif
+
+
+def sidecar_position(xmp: bytes) -> tuple[float | None, float | None]:
+    """Latitude and longitude of an XMP packet."""
+    place = read_place(read_xmp(xmp))
+    return place.latitude, place.longitude

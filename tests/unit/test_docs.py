@@ -25,7 +25,7 @@ def anchors(text: str) -> set[str]:
 
 
 @pytest.mark.parametrize("tool", [make_api_page, make_reference], ids=["calls", "reference"])
-def test_a_generated_page_is_what_the_code_says(tool: Any) -> None:
+def test_generated_pages_are_up_to_date(tool: Any) -> None:
     assert tool.PAGE.read_text() == tool.render_page(), "run `make pages`"
 
 
@@ -44,7 +44,7 @@ def test_every_call_is_described_in_a_sentence() -> None:
 
 
 @pytest.mark.parametrize("found", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_links_between_pages_lead_somewhere(found: Path) -> None:
+def test_links_between_pages_resolve(found: Path) -> None:
     text = re.sub(r"```.*?```", "", found.read_text(), flags=re.DOTALL)
     broken = []
     for link in re.findall(r"\]\(([^)\s]+)\)", text):

@@ -18,7 +18,7 @@ KINDS = [
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_errors_survive_pickling_with_everything_they_say(kind: type[PlacewiseError]) -> None:
+def test_errors_survive_pickling_with_all_attributes(kind: type[PlacewiseError]) -> None:
     error = kind("some_code", "Some detail.", limit=3, key="a")
     for back in (pickle.loads(pickle.dumps(error)), copy.copy(error)):
         assert type(back) is kind
@@ -39,7 +39,7 @@ def test_problem_has_the_members_of_rfc_9457(kind: type[PlacewiseError]) -> None
     }
 
 
-def test_every_status_has_one_kind_of_error() -> None:
+def test_each_status_has_one_error_class() -> None:
     statuses = sorted(kind.status for kind in KINDS if kind.status != 500)
     assert statuses == [400, 401, 403, 404, 408, 409, 410, 411, 413, 415, 422, 429, 503, 507]
 

@@ -32,7 +32,7 @@ Point = tuple[float, float]
         pytest.param((0, 0), (1e-6, 180), HALF_EARTH_M - DEGREE_M / 1e6, id="nearly antipodes"),
     ],
 )
-def test_known_distances(one: Point, other: Point, expected_m: float) -> None:
+def test_distances_equal_published_ones(one: Point, other: Point, expected_m: float) -> None:
     for here, there in ((one, other), (other, one)):
         assert distance_m(*here, *there) == pytest.approx(expected_m, abs=0.001)
 
@@ -87,7 +87,7 @@ def test_the_centre_of_points_lies_between_them(
         assert abs(longitude) == pytest.approx(expected[1], abs=1e-9)
 
 
-def test_dust_is_the_zero_that_was_meant() -> None:
+def test_denormal_coordinates_are_flushed_to_zero() -> None:
     assert [flush_to_zero(degrees) for degrees in (5e-324, -1e-13, 0.0)] == [0, 0, 0]
     assert [flush_to_zero(degrees) for degrees in (-1e-12, 45.07, -180.0)] == [
         -1e-12,

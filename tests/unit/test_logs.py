@@ -72,7 +72,7 @@ def test_json_lines_hold_message_logger_and_request_id(
     assert "ValueError: why" in lines[3]["error"]
 
 
-def test_text_lines_end_with_the_facts(set_up: Set, capsys: pytest.CaptureFixture[str]) -> None:
+def test_text_lines_end_with_the_fields(set_up: Set, capsys: pytest.CaptureFixture[str]) -> None:
     set_up()
     with request_id_context("r-1"):
         logging.getLogger("services.gateway").info("stored", extra={"status": 202})
@@ -104,7 +104,7 @@ def test_a_terminal_of_the_embedded_server_shows_warnings_and_with_debug_all(
 
 @pytest.mark.parametrize("log_format", ["text", "json"])
 @pytest.mark.parametrize("control", ["\r\n", "\x1b", "\x7f", "\x9f", "\u2028", "\u202e", "\ud800"])
-def test_no_value_of_a_caller_starts_a_line_or_controls_a_terminal(
+def test_line_breaks_and_control_characters_of_callers_are_escaped(
     set_up: Set, capsys: pytest.CaptureFixture[str], log_format: str, control: str
 ) -> None:
     forged = "2026-11-21 12:00:00,000 INFO services.request_log: DELETE /api/v1/maps/a: 200"
@@ -131,7 +131,7 @@ def test_no_value_of_a_caller_starts_a_line_or_controls_a_terminal(
 
 
 @pytest.mark.parametrize("sent", [None, "", "a b", "a\nb", "x" * 129, "é", "{{7*7}}"])
-def test_an_id_that_no_header_or_log_should_hold_is_replaced(sent: str | None) -> None:
+def test_an_invalid_request_id_is_replaced(sent: str | None) -> None:
     made = request_id_or_new(sent)
     assert made != sent
     assert len(made) == 36

@@ -127,6 +127,7 @@ def _evaluation_summary(set_: EvaluationSet) -> Json:
         "positives_per_query": {"mean": statistics.fmean(counts) if counts else 0.0}
         | {"most": max(counts, default=0)},
         "rule": set_.rule,
+        "paired_by": set_.paired_by,
         "protocol": set_.protocol,
         "fingerprint": set_.fingerprint,
     }
@@ -168,12 +169,13 @@ def _print_training(figures: Json) -> None:
 
 
 def _print_evaluation(summary: Json) -> None:
+    pairs = f", photos paired by {summary['paired_by']}" if summary["paired_by"] else ""
     # Not a table: it would truncate long names and fingerprints.
     print_message(
         f"{summary['name']}: {summary['database']} database photos, "
         f"{summary['queries']} queries ({summary['queries_without_positives']} without positives); "
         f"{summary['positives_per_query']['mean']:.1f} positives per query "
-        f"({summary['rule']}), protocol {summary['protocol']}, fingerprint "
+        f"({summary['rule']}{pairs}), protocol {summary['protocol']}, fingerprint "
         f"{summary['fingerprint'][:12]}."
     )
 

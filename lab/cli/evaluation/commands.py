@@ -15,14 +15,8 @@ from typing import Annotated, Any
 
 import typer
 
-from services.cli.compare import (
-    DEFAULT_PHOTOS,
-    ExtractorOption,
-    PhotosOption,
-    WeightsOption,
-)
 from services.cli.environment import require_packages
-from services.cli.evaluate import SampleOption, SeedOption, WordWeightsOption, evaluate_map
+from services.cli.evaluate import SampleOption, SeedOption, evaluate_map
 from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption
 from shared.errors import InvalidRequest
 from shared.tracks.motion import parse_motion
@@ -192,7 +186,6 @@ def evaluate(
     ] = False,
     sample: SampleOption = None,
     seed: SeedOption = None,
-    word_weights: WordWeightsOption = False,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
@@ -204,7 +197,7 @@ def evaluate(
     labelled queries. With --data, evaluate a --checkpoint, an --extractor, --rows or a --server on
     a data set. With --predictions, evaluate a file of predictions.
     """
-    map_options: OptionValues = {"--sample": sample, "--seed": seed, "--word-weights": word_weights}
+    map_options: OptionValues = {"--sample": sample, "--seed": seed}
     model_options: OptionValues = {
         "--checkpoint": checkpoint, "--extractor": extractor, "--vocabulary": vocabulary,
         "--fit-vocabulary": fit_vocabulary, "--protocol": protocol, "--rule": rule, "--rows": rows,
@@ -286,7 +279,7 @@ def evaluate(
         evaluate_sets(data, sets, protocol, rule, ground_truth, target, report_options)
         return
     _reject_options("without --data", model_options | file_options | output_options)
-    evaluate_map(sample, seed, word_weights, map_name, server, key, as_json)
+    evaluate_map(sample, seed, map_name, server, key, as_json)
 
 
 def _reject_options(context: str, options: OptionValues) -> None:
@@ -354,9 +347,23 @@ def compare(
         Path | None, typer.Option(help="Output folder for comparison.json and report.html.")
     ] = None,
     faiss_gpu: FaissGpuOption = False,
-    extractor: ExtractorOption = None,
-    photos: PhotosOption = DEFAULT_PHOTOS,
-    weights: WeightsOption = False,
+    extractor: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--extractor",
+            metavar="NAME",
+            help="Map: another extractor, such as A+B or torchscript:/PATH. Can be repeated.",
+        ),
+    ] = None,
+    photos: Annotated[
+        int, typer.Option("--photos", min=20, help="Map: number of photos that are described.")
+    ] = 1000,
+    weights: Annotated[
+        bool,
+        typer.Option(
+            "--weights", help="Map: choose the weights of each A+B on the map's own photos."
+        ),
+    ] = False,
     map_name: MapOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -368,7 +375,7 @@ def compare(
     # Must be set before torch is loaded below; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if data is None:
-        from services.cli.descriptors.compare_on_map import compare_on_map
+        from lab.cli.evaluation.compare_on_map import compare_on_map
 
         compare_on_map(map_name, extractor, photos, weights, as_json)
         return

@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from rich.progress import Progress
 
-from lab.datasets.dataset import EvaluationSet
-from lab.evaluation.descriptor_cache import CachedDescriber, TimedDescriber
-from lab.evaluation.ranking import Rows, refused_photos_error
-from lab.training.model_describer import ModelDescriber
-from services.cli.descriptors.local_extractor import (
-    decode_pixels,
-    describe_photos,
-    load_extractor,
+from lab.cli.descriptors.extractors import (
     load_own_vocabulary,
+    photo_decoder,
+    photo_describer,
     resolve_centres,
 )
+from lab.datasets.dataset import EvaluationSet
+from lab.evaluation.descriptor_cache import CachedDescriber, TimedDescriber
+from lab.training.describing import ModelDescriber
+from services.cli.descriptors.load_extractor import load_extractor
 from services.cli.output import stage_bars
 from shared.config.settings import Settings
 from shared.descriptors.extractor import Extractor, choose_device, spec_fingerprint
 from shared.descriptors.patches import fit_vocabulary, sample_photos
 from shared.descriptors.vocabulary import ClusterCentres
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
-from shared.errors import PlacewiseError
 from shared.extractor_config.configs import get_extractor_config
 from shared.imaging.decode import DECODER
 
@@ -50,33 +47,6 @@ class Describer:
     @property
     def fingerprint(self) -> str:
         return spec_fingerprint(self.spec)
-
-
-class ExtractorDescriber:
-    """Describes photos with an extractor, decoding them in child processes as for uploads."""
-
-    def __init__(
-        self, extractor: Extractor, centres: ClusterCentres | None, settings: Settings
-    ) -> None:
-        self._extractor = extractor
-        self._centres = centres
-        self._settings = settings
-        self._seconds: defaultdict[str, float] = defaultdict(float)
-        self.seconds = 0.0
-        """Inference time of `photos`, without decoding, which overlaps."""
-        self.photos = 0
-
-    def __call__(self, photos: Sequence[Path]) -> Iterator[Rows]:
-        """Yield (b, D) batches in the order of the photos, then raise an error of those refused."""
-        refused: list[tuple[Path, PlacewiseError]] = []
-        for rows in describe_photos(
-            photos, self._extractor, self._centres, self._settings, refused, self._seconds
-        ):
-            self.seconds = self._seconds["describe"]
-            self.photos += len(rows)
-            yield rows
-        if refused:
-            raise refused_photos_error(refused, len(photos))
 
 
 def checkpoint_describer(
@@ -140,7 +110,7 @@ def extractor_describer(
         if centres is not None:
             about["vocabulary"] = vocabulary.name if vocabulary else "shipped"
     spec = extractor.spec(centres)
-    describe = ExtractorDescriber(extractor, centres, settings)
+    describe = photo_describer(extractor, centres, settings)
     about |= {"precision": extractor.precision, "device": extractor.backbone.device.type}
     return Describer(config.name, _with_cache(describe, spec, settings), spec, about)
 
@@ -152,7 +122,7 @@ def _fit_vocabulary(
     photos = [database[index] for index in sampled]
     fitted = fit_vocabulary(
         extractor,
-        decode_pixels(photos, extractor.preprocessing, settings, []),
+        (pixels for _, pixels in photo_decoder(extractor, settings).batches(photos, [])),
         len(photos),
         clusters=extractor.config.clusters,
         seed=SEED,

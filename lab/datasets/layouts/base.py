@@ -35,6 +35,8 @@ class ListedSet:
     """Positives by that rule, if the set includes a ground truth."""
     drops_queries: bool = False
     """Whether the protocol excludes queries without positives."""
+    paired_by: str | None = None
+    """What numbers the photos of two seasons, in words; None for other sets"""
 
 
 class EvaluationLayout(ABC):

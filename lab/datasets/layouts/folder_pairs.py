@@ -3,7 +3,8 @@
 Several query sets share a database as `queries_v1/`, `queries_v2/` (SF-XL). Beside `database/`,
 `rides/` may have one folder for each sequence: the set `NAME_rides`. Two folders of seasons, such
 as `summer/` and `winter/`, are two rides along the same way, as in Nordland (Suenderhauf et al.
-2013): the first is the database, and photos of about the same number show the same place. In
+2013): the first is the database, and photos of about the same number show the same place. That is
+the number in their names where both seasons have it, or else the position in the sorted folder. In
 `database/` and `queries/` with as many photos each, without positions, labels and numbers in file
 names, photos are numbered as well, for the rule `frames 10`.
 
@@ -15,7 +16,9 @@ deep-visual-geo-localization-benchmark)
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,6 +38,8 @@ RIDES = "rides"
 SEASONS = ("summer", "spring", "fall", "autumn", "winter")
 """Names of folders of one season each; the database is the first one that exists"""
 SAME_INDEX_RULE = "frames 10"
+MIN_COMMON_SHARE = 0.5
+"""Share of the shorter season's numbers that the other one has, too; counters of days differ"""
 VME_PROTOCOL = "vme"
 """Protocol of VPR-methods-evaluation: compares metres of different zones as if of one zone"""
 
@@ -64,8 +69,7 @@ class FolderPairs(EvaluationLayout):
             return ListedSet(photos, _read_rides(base), _default_rule(photos))
         if key in SEASONS:
             pair = (_seasons(base)[0], key)
-            before, after = (_number(_read_photos(base / season, base)) for season in pair)
-            return ListedSet(before, after, SAME_INDEX_RULE)
+            return _pair_seasons(*(_read_photos(base / season, base) for season in pair))
         folder = base / key
         database, queries = (
             _read_photos(photos, base) for photos in (folder.with_name("database"), folder)
@@ -100,8 +104,34 @@ def _read_rides(base: Path) -> tuple[DatasetPhoto, ...]:
     return tuple(frames)
 
 
-def _number(photos: Sequence[DatasetPhoto]) -> tuple[DatasetPhoto, ...]:
-    return tuple(replace(photo, frame=number) for number, photo in enumerate(photos))
+def _number(
+    photos: Sequence[DatasetPhoto], numbers: Sequence[int] = ()
+) -> tuple[DatasetPhoto, ...]:
+    """Number photos by their order if there are no `numbers`."""
+    pairs = zip(photos, numbers or range(len(photos)), strict=True)
+    return tuple(replace(photo, frame=number) for photo, number in pairs)
+
+
+def _pair_seasons(before: Sequence[DatasetPhoto], after: Sequence[DatasetPhoto]) -> ListedSet:
+    """Number the photos of two seasons by their names, or by their positions."""
+    pairs = itertools.product(_name_numbers(before), _name_numbers(after))
+    best = max(pairs, key=lambda pair: len(set(pair[0]).intersection(pair[1])), default=((), ()))
+    common = len(set(best[0]).intersection(best[1]))
+    if not common or common < MIN_COMMON_SHARE * min(len(before), len(after)):
+        best, paired_by = ((), ()), "their positions in the sorted folders"
+    else:
+        paired_by = "the number in their names"
+    numbered = _number(before, best[0]), _number(after, best[1])
+    return ListedSet(*numbered, SAME_INDEX_RULE, paired_by=paired_by)
+
+
+def _name_numbers(photos: Sequence[DatasetPhoto]) -> Iterator[tuple[int, ...]]:
+    """Yield the first, the second, ... numbers in the photos' names, if each photo has its own."""
+    found = [re.findall(r"\d{1,15}", photo.path.stem) for photo in photos]
+    for column in zip(*found, strict=False):  # as far as all names have numbers
+        numbers = tuple(map(int, column))
+        if len(set(numbers)) == len(photos):
+            yield numbers
 
 
 def _default_rule(photos: tuple[DatasetPhoto, ...]) -> str:

@@ -21,7 +21,7 @@ from services.cli.descriptors.local_weights import (
     list_extractor_configs,
     save_record,
 )
-from services.cli.environment import read_settings
+from services.cli.environment import import_lab, read_settings
 from services.cli.output import (
     JsonOption,
     KeyOption,
@@ -257,10 +257,9 @@ def fit_pca(
     as_json: JsonOption = False,
 ) -> None:
     """Fit a PCA whitening without a server and write it to a file for `describe --pca`."""
-    from services.cli.descriptors.local_fit import fit_pca_locally  # imports torch
-
+    fits = import_lab("lab.cli.descriptors.fits", "`models fit-pca`")
     with progress_bar() as progress:
-        fitted = fit_pca_locally(
+        fitted = fits.fit_pca_locally(
             source, out, dimension, extractor=extractor, vocabulary=vocabulary, progress=progress
         )
     if not as_json:

@@ -12,6 +12,7 @@ from rich.table import Column
 
 from placewise.answers import Generation, Job
 from services.cli.client import active_generation, connect, wait_for_job
+from services.cli.environment import import_lab
 from services.cli.output import (
     Json,
     JsonOption,
@@ -77,10 +78,9 @@ def fit(
         _reject_options("a map", {"--map": map_name})
         if out is None:
             raise InvalidRequest("bad_out", "Specify the output file: --out FILE.npz")
-        from services.cli.descriptors.local_fit import fit_vocabulary_on_folder  # imports torch
-
+        fits = import_lab("lab.cli.descriptors.fits", "`vocabulary fit DIR`")
         with progress_bar() as progress:
-            fitted = fit_vocabulary_on_folder(
+            fitted = fits.fit_vocabulary_on_folder(
                 folder,
                 out,
                 extractor=extractor,

@@ -1,6 +1,6 @@
 """Local photos with their metadata: from a CSV table, a JSONL manifest or `@UTM@` file names.
 
-The server reads EXIF itself and uses it for every field that is not given here.
+The server reads EXIF and XMP itself and uses them for every field that is not given here.
 """
 
 from __future__ import annotations
@@ -8,18 +8,30 @@ from __future__ import annotations
 import contextlib
 import glob
 import io
-import sys
+import re
+import unicodedata
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime
 from pathlib import Path
 from typing import BinaryIO
 
+from services.cli.ingest.local_headers import (
+    dated_photo,
+    find_sidecars,
+    in_time_zone,
+    parse_time_zone,
+    read_local_header,
+    read_sidecar,
+)
 from services.cli.ingest.photo_archive import ArchivedFile, PhotoArchive, is_archive
-from services.cli.output import utf8_path
+from services.cli.output import Json, utf8_path
 from shared.errors import InvalidRequest, PlacewiseError
+from shared.geotagging.evidence import add_time_zones
+from shared.imaging.capture_place import is_null_island
 from shared.imaging.file_formats import PHOTO_SUFFIXES
-from shared.imaging.photo_header import read_photo_header
+from shared.imaging.photo_header import PhotoHeader
 from shared.ingest.photo_metadata import (
     MAX_REPORTED_LINES,
     bad_lines_error,
@@ -27,6 +39,8 @@ from shared.ingest.photo_metadata import (
     read_jsonl_manifest,
 )
 from shared.utm_filenames import upload_fields_of_file_name
+
+HEADER_FIELDS = ("latitude", "longitude", "altitude", "heading", "captured_at")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +57,8 @@ class LocalPhoto:
     """Path in the folder or archive that is indexed."""
     archived: ArchivedFile | None = None
     """The photo in its archive."""
+    sidecars: Mapping[str, bytes] = field(default_factory=dict)
+    """XMP by path"""
 
     @property
     def file(self) -> Path:
@@ -95,23 +111,9 @@ def count_other_files(source: Path | PhotoArchive) -> Counter[str]:
         path.suffix.lower()
         for path in source.rglob("*")
         if path.suffix.lower() not in PHOTO_SUFFIXES
-        and not path.name.startswith(".")
+        and not _is_hidden(path, source)
         and path.is_file()
     )
-
-
-def has_coordinates(photo: LocalPhoto) -> bool:
-    """Return whether a photo has coordinates in its fields or its EXIF.
-
-    A file that can't be read counts as one with: its upload reports what is wrong with it.
-    """
-    if "latitude" in photo.fields:
-        return True
-    try:
-        with photo.open() as file:
-            return read_photo_header(file, sys.maxsize).latitude is not None
-    except (OSError, PlacewiseError):
-        return True
 
 
 def find_photos(
@@ -158,9 +160,71 @@ def find_photos(
                 {**fields, **table_fields.get(path, {})},
                 relative_path=utf8_path(path.relative_to(folder)),
                 archived=archived,
+                sidecars={utf8_path(each): read_sidecar(each) for each in find_sidecars(path)}
+                if archived is None
+                else archived.read_sidecars(),
             )
         )
     return photos
+
+
+@dataclass(slots=True)
+class HeaderReport:
+    """What the headers of photos say that are about to be uploaded."""
+
+    without_coordinates: int = 0
+    without_time_zone: int = 0
+    """Photos whose time is that of a clock, taken as UTC."""
+    not_understood: list[Json] = field(default_factory=list)
+    """Photos with coordinates that are not used: path, reason."""
+
+
+def add_local_headers(
+    photos: Sequence[LocalPhoto], time_zone: str | None
+) -> tuple[list[LocalPhoto], HeaderReport]:
+    """Add the fields that the server can't read from a photo alone.
+
+    These are the place and time in its sidecars, and the time in UTC if the zone of its clock
+    follows from other photos by the same camera, or is given.
+
+    Raises:
+        InvalidRequest: `bad_time_zone`.
+    """
+    zone = parse_time_zone(time_zone) if time_zone else None
+    headers = []
+    for photo in photos:
+        try:
+            with photo.open() as file:
+                own = read_local_header(file)
+                whole = read_local_header(file, photo.sidecars.values()) if photo.sidecars else own
+        except (OSError, PlacewiseError):
+            own = whole = PhotoHeader(0, 0)  # its upload reports what is wrong with it
+        headers.append((own, whole))
+    dated = add_time_zones(
+        [dated_photo(str(number), whole) for number, (_, whole) in enumerate(headers)]
+    )
+    if zone is not None:
+        dated = [in_time_zone(each, zone) for each in dated]
+    report = HeaderReport()
+    complete = []
+    for photo, (own, whole), each in zip(photos, headers, dated, strict=True):
+        values = {name: getattr(whole, name) for name in HEADER_FIELDS} | {"captured_at": each.time}
+        added = {
+            name: value.isoformat() if isinstance(value, datetime) else repr(value)
+            for name, value in values.items()
+            if value is not None and value != getattr(own, name)
+        }
+        if _has_place(photo.fields):
+            added = {n: text for n, text in added.items() if n not in ("latitude", "longitude")}
+        elif whole.gps_error is not None:
+            found = {"path": utf8_path(photo.path), "reason": whole.gps_error}
+            report.not_understood.append(found)
+        elif whole.latitude is None and whole.width:
+            report.without_coordinates += 1
+        is_local = each.time is not None and not each.time_zone_is_known
+        report.without_time_zone += is_local and "captured_at" not in photo.fields
+        complete.append(replace(photo, fields={**added, **photo.fields}))
+    return complete, report
 
 
 def read_photo_manifest(manifest: Path, data: bytes) -> list[LocalPhoto]:
@@ -176,7 +240,8 @@ def read_photo_manifest(manifest: Path, data: bytes) -> list[LocalPhoto]:
     photos = []
     missing = []
     for line in read_jsonl_manifest(data, str(manifest)):
-        path = manifest.parent / line.name
+        possible = list(_possible_paths(manifest.parent, line.name))
+        path = next((path for path in possible if path.is_file()), possible[0])
         if not path.is_file():
             missing.append((line.line, f"photo {path} does not exist"))
         photos.append(
@@ -184,6 +249,7 @@ def read_photo_manifest(manifest: Path, data: bytes) -> list[LocalPhoto]:
                 path,
                 {**upload_fields_of_file_name(path.name, None), **line.fields},
                 relative_path=line.name,
+                sidecars={utf8_path(each): read_sidecar(each) for each in find_sidecars(path)},
             )
         )
     if missing:
@@ -200,11 +266,14 @@ def list_photos(folder: Path) -> list[Path]:
         InvalidRequest: `no_photos` if there is none.
     """
     paths = sorted(
-        path
-        for path in folder.rglob("*")
-        if path.is_file()
-        and path.suffix.lower() in PHOTO_SUFFIXES
-        and not path.name.startswith(".")
+        (
+            path
+            for path in folder.rglob("*")
+            if path.is_file()
+            and path.suffix.lower() in PHOTO_SUFFIXES
+            and not _is_hidden(path, folder)
+        ),
+        key=_name_order,
     )
     if not paths:
         raise InvalidRequest(
@@ -221,10 +290,38 @@ def _read_csv_fields(folder: Path, table: Path, paths: set[Path]) -> dict[Path, 
         raise InvalidRequest("bad_table", f"Can't read {table}: {error}") from error
     fields = {}
     for row in read_csv_manifest(data, str(table)):
-        path = folder / row.name
-        if path not in paths:
+        path = next((path for path in _possible_paths(folder, row.name) if path in paths), None)
+        if path is None:
             raise bad_lines_error(
-                "bad_table", str(table), [(row.line, f"photo {path} does not exist")]
+                "bad_table", str(table), [(row.line, f"photo {folder / row.name} does not exist")]
             )
         fields[path] = row.fields
     return fields
+
+
+def _has_place(fields: Mapping[str, str]) -> bool:
+    """Return whether the fields have coordinates, right or wrong; 0, 0 are none."""
+    with contextlib.suppress(ValueError):
+        return not is_null_island(
+            float(fields.get("latitude", 0)), float(fields.get("longitude", 0))
+        )
+    return True
+
+
+def _possible_paths(folder: Path, name: str) -> Iterator[Path]:
+    """Yield the paths that a table may mean: of another system, or with composed characters."""
+    for slashes in (name, name.replace("\\", "/")):
+        yield folder / slashes
+        for form in ("NFC", "NFD"):
+            yield folder / unicodedata.normalize(form, slashes)
+
+
+def _is_hidden(path: Path, folder: Path) -> bool:
+    return any(part.startswith(".") for part in path.relative_to(folder).parts)
+
+
+def _name_order(path: Path) -> tuple[object, ...]:
+    """Return the key that sorts paths: `a (1).jpg`, a copy, comes after `a.jpg`."""
+    copy = re.fullmatch(r"(.*?) ?\((\d{1,9})\)", path.stem)
+    stem, number = (copy[1], int(copy[2])) if copy else (path.stem, 0)
+    return (*path.parent.parts, stem), number, path.suffix

@@ -21,10 +21,10 @@ from services.cli.environment import read_settings
 from services.cli.ingest.anyloc import read_anyloc_photos
 from services.cli.ingest.geotags import (
     LocalPhoto,
+    add_local_headers,
     count_other_files,
     find_local_sources,
     find_photos,
-    has_coordinates,
     open_local_source,
     read_photo_manifest,
 )
@@ -49,6 +49,7 @@ from services.cli.output import (
     print_failures,
     print_json,
     print_note,
+    printable_text,
     progress_bar,
 )
 from shared.catalog.photo_role import PhotoRole
@@ -91,6 +92,13 @@ def index(
         str | None,
         typer.Option(help="UTM zone of @UTM@ file names that don't contain it, such as 32T."),
     ] = None,
+    time_zone: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ZONE",
+            help="Time zone of photos whose EXIF has none, such as +02:00 or Europe/Paris.",
+        ),
+    ] = None,
     places: Annotated[
         bool,
         typer.Option(
@@ -125,13 +133,15 @@ def index(
 ) -> None:
     """Upload photos and wait until they are searchable.
 
-    Coordinates are read from the CSV table or manifest, from @UTM@ file names, or from EXIF. An
+    Coordinates are read from the CSV table or manifest, from @UTM@ file names, from EXIF or XMP in
+    the photo, or from its sidecar (IMG_1.jpg.xmp, IMG_1.xmp). An
     archive may contain its own table: photos.csv or manifest.jsonl. The command is idempotent: run
     it again after an interruption.
     """
     folder_options = {
         "--csv": table,
         "--utm-zone": utm_zone,
+        "--time-zone": time_zone,
         "--places-by-folder": places,
         "--role": role != PhotoRole.DATABASE,
     }
@@ -191,6 +201,18 @@ def index(
                     "an archive, download or create it again. Photos end with "
                     f"{', '.join(sorted(PHOTO_SUFFIXES))}.",
                 )
+        if photos and anyloc is None:
+            photos, headers = add_local_headers(photos, time_zone)
+            sidecars = len({path for photo in photos for path in photo.sidecars})
+            others = sum(map(count_other_files, opened), Counter[str]()) - Counter(
+                {".xmp": sidecars}
+            )
+            about_sources = {
+                "other_files": others.total(),
+                "other_suffixes": dict(others.most_common()),
+                "sidecars": sidecars,
+                **asdict(headers),
+            }
         client = stack.enter_context(connect(server, map_name, key))
         progress = stack.enter_context(progress_bar())
         print_note(f"Indexing into {describe_target(client, server, map_name)}")
@@ -203,13 +225,6 @@ def index(
             url = server or str(read_settings().placewise_home.resolve())
             used = stack.enter_context(UploadJournal(journal, url, map_name)) if journal else None
             report = upload_photos(client, photos, progress, update=update, journal=used)
-        if opened:
-            suffixes = sum(map(count_other_files, opened), Counter[str]())
-            about_sources = {
-                "other_files": suffixes.total(),
-                "other_suffixes": dict(suffixes.most_common()),
-                "without_coordinates": sum(not has_coordinates(p) for p in photos),
-            }
     report |= about_sources
     if failures is not None:
         _write_failures(failures, report)
@@ -258,11 +273,29 @@ def _print_report(report: Json, server: str | None, map_name: str | None, role: 
     if "rows" in report:
         print_note(f"{report['rows']} database rows, {report['unlisted']} photos without one.")
         print_failures(report, "missing", "duplicates")
+    if report.get("updated"):
+        print_note(
+            f"{_count(report['updated'], 'photo')} updated: the map has the same picture, and the "
+            "file has new metadata."
+        )
     if report.get("other_files") or report.get("without_coordinates"):
         print_note(
             f"{_count(report['other_files'], 'other file')} skipped{_list_suffixes(report)}, "
             f"{_count(report['without_coordinates'], 'photo')} without coordinates."
         )
+    if report.get("sidecars"):
+        print_note(f"{_count(report['sidecars'], 'sidecar')} (XMP) read.")
+    if report.get("without_time_zone"):
+        print_note(
+            f"{_count(report['without_time_zone'], 'photo')} with a time but no time zone: the "
+            "time is taken as UTC. Pass the zone: --time-zone +02:00 or --time-zone Europe/Paris."
+        )
+    if report.get("not_understood"):
+        number = len(report["not_understood"])
+        have = "photo has" if number == 1 else "photos have"
+        print_note(f"{number} {have} a GPS tag that could not be read:")
+        for item in report["not_understood"]:
+            print_note(f"{printable_text(item['path'])}: {item['reason']}")
     print_failures(report, "refused", "failed")
     command = ("query", "PHOTO") if role == PhotoRole.DATABASE else ("evaluate",)
     print_note(f"Next: {client_command(*command, server=server, map_name=map_name)}")

@@ -6,6 +6,7 @@ import contextlib
 import io
 import stat
 import tarfile
+import unicodedata
 import zipfile
 import zlib
 from collections import Counter
@@ -14,8 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Self, cast
 
+from services.cli.ingest.local_headers import SIDECAR_SUFFIX, sidecar_names
 from services.cli.output import printable_path
-from shared.errors import InvalidRequest, TooLarge
+from shared.errors import InvalidRequest, PlacewiseError, TooLarge
+from shared.imaging.bounded_reader import MAX_METADATA_BYTES
 from shared.imaging.file_formats import PHOTO_SUFFIXES
 from shared.ingest.photo_metadata import (
     MAX_MANIFEST_BYTES,
@@ -67,6 +70,18 @@ class ArchivedFile:
         with _convert_read_errors(self.name, "Unpack the archive and index the folder."):
             return self.archive.read(self.info)
 
+    def read_sidecars(self) -> dict[str, bytes]:
+        """Return the XMP sidecars of a photo by path; one that can't be read is empty."""
+        folder, slash, name = self.name.rpartition("/")
+        found = {}
+        for each in sidecar_names(name):
+            file = self.archive.sidecars.get(f"{folder}{slash}{each}")
+            if file is not None:
+                found[f"{self.archive.path}/{file.name}"] = b""
+                with contextlib.suppress(PlacewiseError):
+                    found[f"{self.archive.path}/{file.name}"] = file.read()[:MAX_METADATA_BYTES]
+        return found
+
 
 class PhotoArchive:
     """The photos of a zip or tar; a context manager that keeps it open."""
@@ -82,6 +97,8 @@ class PhotoArchive:
         """In the order of the archive: reading them in another one is slow for a gzipped tar."""
         self.other_files: Counter[str] = Counter()
         """Number of files that are no photos by their suffix; hidden ones are left out."""
+        self.sidecars: dict[str, ArchivedFile] = {}
+        """XMP by name, also counted among `other_files`"""
         self._tables: list[ArchivedFile] = []
         with _convert_read_errors(printable_path(path), "Create the archive again."):
             self._file = _open(path)
@@ -139,13 +156,15 @@ class PhotoArchive:
         folder = PurePosixPath(table.name).parent
         fields = {}
         missing = []
-        photos = {photo.name for photo in self.photos}
+        # Archives of macOS have decomposed names; tables are often typed elsewhere.
+        photos = {unicodedata.normalize("NFC", photo.name): photo.name for photo in self.photos}
         for entry in entries:
-            name = parse_relative_path(str(folder / entry.name))
-            if name not in photos:
+            name = parse_relative_path(str(folder / entry.name)) or ""
+            found = photos.get(unicodedata.normalize("NFC", name))
+            if found is None:
                 missing.append((entry.line, f"photo {name} does not exist"))
             else:
-                fields[name] = entry.fields
+                fields[found] = entry.fields
         if missing:
             code = "bad_table" if is_csv else "bad_manifest"
             raise bad_lines_error(code, table.name, missing[:MAX_REPORTED_LINES])
@@ -165,6 +184,8 @@ class PhotoArchive:
                 self.photos.append(file)
             else:
                 self.other_files[suffix] += 1
+                if suffix == SIDECAR_SUFFIX:
+                    self.sidecars[name] = file
         if not self.photos:
             raise InvalidRequest(
                 "no_photos",

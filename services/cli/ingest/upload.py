@@ -6,6 +6,7 @@ and for the vocabulary fit that the server starts if the map has enough photos.
 
 from __future__ import annotations
 
+import functools
 import json
 import time
 from collections import Counter, deque
@@ -71,9 +72,9 @@ def upload_photos(
     refused. Uploads that the journal records are skipped, and new ones are recorded.
 
     Returns:
-        Counts (`photos`, `uploaded`, `already_there`, and `searchable` in the whole map), the
-        `refused` and `failed` photos with reasons, the kind of the map's `vocabulary`, and the job
-        of the vocabulary that was `fitted`, if any.
+        Counts (`photos`, `uploaded`, `already_there`, `updated`, and `searchable` in the whole
+        map), the `refused` and `failed` photos with reasons, the kind of the map's `vocabulary`,
+        and the job of the vocabulary that was `fitted`, if any.
     """
     client.stats()  # fails early, and once, for a wrong URL, key or map
     counts: Counter[str] = Counter()
@@ -107,6 +108,7 @@ def upload_photos(
             refused.append(_photo_failure(photo, outcome.detail))
             continue
         counts["already_there" if outcome.already_there else "uploaded"] += 1
+        counts["updated"] += bool(outcome.updated)
         if journal is not None:
             journal.add(photo, outcome)
         if outcome.job_id is not None and outcome.status not in FINISHED:
@@ -121,6 +123,7 @@ def upload_photos(
         "photos": len(photos),
         "uploaded": counts["uploaded"],
         "already_there": counts["already_there"],
+        "updated": counts["updated"],
         "searchable": stats.searchable_images,
         "refused": refused,
         "failed": failed,
@@ -239,8 +242,15 @@ def wait_until_described(client: Client, job_id: str | UUID) -> Job:
     """Wait until the photo's job ends, or waits for a vocabulary; return it."""
     job = client.job(job_id)  # at once: thousands of jobs may wait for a vocabulary
     while not job.finished and not job.waiting_for:
+        if job.error is not None:  # it is retried until an operator has removed the cause
+            _note_once(f"The photos wait: {job.error['code']}: {job.failure}")
         job = client.job(job_id, POLL_SECONDS)
     return job
+
+
+@functools.cache
+def _note_once(message: str) -> None:
+    print_note(message)
 
 
 def _photo_failure(photo: LocalPhoto, reason: str) -> Json:

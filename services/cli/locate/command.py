@@ -153,9 +153,9 @@ def locate(
         check_time_zones(photos, "--together")
     track: Sequence[KnownPosition] = ()
     if gpx is not None:
-        check_time_zones([p for p in photos if p.latitude is None], "--gpx")
+        check_time_zones([p for p in photos if p.is_unlocated], "--gpx")
         track = read_gpx(gpx)
-    unlocated = [photo for photo in photos if photo.latitude is None]
+    unlocated = [photo for photo in photos if photo.is_unlocated]
     states = {photo.path: file_state(photo.path) for photo in unlocated}
     searches: dict[Path, SearchedPhoto] = {}
     if preview is not None:
@@ -246,6 +246,7 @@ def _locate_photo(
         searched.place,
         searched.place_probability,
         searched.error,
+        neighbours.why_unknown(photo),
     )
 
 
@@ -262,7 +263,7 @@ def picture_evidence(answer: Similar, photo_count: int) -> PictureEvidence:
             SimilarPosition(
                 photo.latitude,
                 photo.longitude,
-                photo.similarity_score if photo.weighted_score is None else photo.weighted_score,
+                photo.similarity_score,
                 photo.relative_path or photo.original_filename,
             )
             for photo in answer.similar_images
@@ -316,7 +317,12 @@ def _to_json(
 ) -> Json:
     return {
         "photos": len(photos),
-        "with_coordinates": len(photos) - len(located),
+        "with_coordinates": sum(photo.latitude is not None for photo in photos),
+        "not_understood": [
+            {"filename": photo.name, "reason": photo.gps_error}
+            for photo in photos
+            if photo.gps_error
+        ],
         "accept": accept,
         "proposals": [
             {
@@ -361,18 +367,32 @@ def _print_proposals(
             *([escape(each.place or "")] if any(each.place for each in located) else []),
             f"{found.radius_m:.0f} m" if found else "",
             format_percent(each.probability) if found or each.place else "",
-            escape(each.error or (found.reason if found else "nothing is known about its place")),
+            escape(each.error or (found.reason if found else each.why_unknown)),
             style=None if each in accepted else "dim",
         )
+    with_coordinates = sum(photo.latitude is not None for photo in photos)
+    for photo in photos:
+        if photo.gps_error:
+            line = f"{printable_text(photo.name)}: {photo.gps_error}"
+            err_console.print(f"[red]left as it is[/red] {escape(line)}", soft_wrap=True)
     if not located:
-        print_message(f"All {len(photos)} photos have coordinates: there is nothing to locate.")
+        print_message(
+            f"{with_coordinates} of {len(photos)} photos have coordinates: there is nothing to "
+            "locate."
+        )
         return
     print_table(table)
     print_message(
-        f"{len(photos) - len(located)} of {len(photos)} photos have coordinates; "
+        f"{with_coordinates} of {len(photos)} photos have coordinates; "
         f"{len(accepted)} of the {len(located)} others have a proposal with at least "
         f"{100 * accept:g} %."
     )
+    without_zone = sum(p.time is not None and not p.time_zone_is_known for p in photos)
+    if without_zone:
+        print_note(
+            f"The clocks of {without_zone} photos have no time zone, so that they are compared "
+            "with one another only. Pass it: --time-zone +02:00 or --time-zone Europe/Paris."
+        )
     if written is None:
         if accepted:
             print_note("Nothing is written. --write sidecar, exif, csv or gpx writes them.")

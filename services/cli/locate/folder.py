@@ -3,27 +3,41 @@
 from __future__ import annotations
 
 import contextlib
-import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta, timezone, tzinfo
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, field, replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from xml.etree import ElementTree
-from zoneinfo import ZoneInfo
 
 from services.cli.ingest.geotags import list_photos
-from services.cli.locate.sidecars import embedded_xmp, find_sidecar, read_position
+from services.cli.ingest.local_headers import (
+    dated_photo,
+    find_sidecars,
+    in_time_zone,
+    move_time,
+    parse_time_zone,
+    read_local_header,
+    read_sidecar,
+)
 from services.cli.output import printable_path, utf8_path
-from shared.errors import InvalidRequest, PlacewiseError
-from shared.geotagging.evidence import DatedPhoto, KnownPosition
-from shared.imaging.photo_header import PhotoHeader, read_photo_header
+from shared.errors import InvalidRequest
+from shared.geotagging.evidence import DatedPhoto, KnownPosition, add_time_zones
+from shared.imaging.capture_place import is_null_island
+from shared.imaging.photo_header import PhotoHeader
 
 
 @dataclass(frozen=True, slots=True)
 class FolderPhoto(DatedPhoto):
     """A photo of the folder; its coordinates are of the EXIF, of XMP in it, or of its sidecar."""
 
-    path: Path
+    path: Path = field(kw_only=True)
+    gps_error: str | None = field(kw_only=True)
+    """why it may have coordinates although none are known"""
+
+    @property
+    def is_unlocated(self) -> bool:
+        """Whether the photo certainly has no coordinates."""
+        return self.latitude is None and self.gps_error is None
 
 
 def read_folder(
@@ -39,40 +53,17 @@ def read_folder(
     Raises:
         InvalidRequest: `no_photos`, `bad_time_zone`.
     """
-    zone = _parse_time_zone(time_zone) if time_zone else None
-    photos = [read_photo(folder, path, zone) for path in list_photos(folder)]
+    zone = parse_time_zone(time_zone) if time_zone else None
+    read = add_time_zones([read_photo(folder, path) for path in list_photos(folder)])
+    photos = [photo if zone is None else in_time_zone(photo, zone) for photo in read]
     ahead = timedelta(seconds=clock_offset_seconds)
-    unlocated = {photo.camera for photo in photos if photo.latitude is None}
+    unlocated = {photo.camera for photo in photos if photo.is_unlocated}
     return [
-        replace(photo, time=_in_range(photo.time, lambda time: time - ahead))
+        replace(photo, time=move_time(photo.time, lambda time: time - ahead))
         if photo.camera in unlocated
         else photo
         for photo in photos
     ]
-
-
-def _in_range(time: datetime | None, change: Callable[[datetime], datetime]) -> datetime | None:
-    """Change a time; None if it was no date, such as 0001-01-01, which can't be moved."""
-    try:
-        return None if time is None else change(time)
-    except OverflowError:
-        return None
-
-
-def _parse_time_zone(text: str) -> tzinfo:
-    """Parse an offset such as `+02:00`, `UTC` or a name of the time zone database."""
-    with contextlib.suppress(ValueError):
-        offset = datetime.fromisoformat(f"2000-01-01T00:00:00{text}").utcoffset()
-        if offset is not None:
-            return timezone(offset)
-    try:
-        return ZoneInfo(text)
-    except (ValueError, LookupError, OSError) as error:
-        raise InvalidRequest(
-            "bad_time_zone",
-            f"{text!r} is no time zone. Write an offset such as +02:00, or a name such as "
-            "Europe/Paris.",
-        ) from error
 
 
 def check_time_zones(photos: Sequence[FolderPhoto], why: str) -> None:
@@ -110,7 +101,8 @@ def read_gpx(path: Path) -> list[KnownPosition]:
             latitude, longitude = float(element.attrib["lat"]), float(element.attrib["lon"])
             if not (abs(latitude) <= 90 and abs(longitude) <= 180):
                 raise ValueError(f"the position {latitude}, {longitude} does not exist")
-            points.append(KnownPosition(time, latitude, longitude))
+            if not is_null_island(latitude, longitude):
+                points.append(KnownPosition(time, latitude, longitude))
     except (OSError, ElementTree.ParseError, KeyError, ValueError, OverflowError) as error:
         raise InvalidRequest(
             "bad_gpx", f"Can't read the GPX track {printable_path(path)}: {error}"
@@ -122,28 +114,12 @@ def read_gpx(path: Path) -> list[KnownPosition]:
     return sorted(points, key=lambda point: point.time)
 
 
-def read_photo(folder: Path, path: Path, zone: tzinfo | None = None) -> FolderPhoto:
-    """Read the header of a photo and its sidecar; `zone` is that of times without one."""
-    header, xmp = PhotoHeader(0, 0), None
+def read_photo(folder: Path, path: Path) -> FolderPhoto:
+    """Read the header of a photo and its sidecars."""
+    sidecars = [read_sidecar(sidecar) for sidecar in find_sidecars(path)]
+    header = PhotoHeader(0, 0)
     # The search names what is wrong with a photo that can't be read.
-    with contextlib.suppress(PlacewiseError, OSError), path.open("rb") as file:
-        header = read_photo_header(file, sys.maxsize)
-        file.seek(0)
-        xmp = embedded_xmp(file)
-    time = header.captured_at
-    if zone is not None and not header.time_zone_is_known:
-        time = _in_range(time, lambda clock: clock.replace(tzinfo=zone).astimezone(UTC))
-    latitude, longitude = header.latitude, header.longitude
-    sidecar = find_sidecar(path)
-    for data in (xmp, sidecar.read_bytes() if sidecar else None):
-        if latitude is None and data is not None:
-            latitude, longitude = read_position(data) or (None, None)
-    return FolderPhoto(
-        utf8_path(path.relative_to(folder)),
-        time,
-        header.time_zone_is_known or (time is not None and zone is not None),
-        header.camera,
-        latitude,
-        longitude,
-        path,
-    )
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        header = read_local_header(file, sidecars)
+    dated = dated_photo(utf8_path(path.relative_to(folder)), header)
+    return FolderPhoto(*astuple(dated), path=path, gps_error=header.gps_error)

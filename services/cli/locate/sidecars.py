@@ -1,6 +1,6 @@
-"""XMP sidecars: coordinates are read, and added to a sidecar without changing anything else in it.
+"""Coordinates that are added to an XMP sidecar without changing anything else in it.
 
-XMP is RDF in XML (ISO 16684-1). Coordinates are properties of the EXIF schema with degrees and
+Coordinates are properties of the EXIF schema with degrees and
 decimal minutes, such as `exif:GPSLatitude="48,51.500000N"`. They go into an `rdf:Description` of
 their own before the end of `rdf:RDF`; all other bytes stay as they are, which no XML library of
 Python does when it writes a document again.
@@ -8,20 +8,13 @@ Python does when it writes a document again.
 
 from __future__ import annotations
 
-import os
-import re
 from pathlib import Path
-from typing import BinaryIO
-from xml.etree import ElementTree
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 from shared.errors import Unprocessable
-from shared.imaging.file_formats import PHOTO_READ_ERRORS
-from shared.imaging.file_structure import read_structure
+from shared.imaging.xmp import EXIF, RDF, read_xmp
 
-EXIF = "http://ns.adobe.com/exif/1.0/"
-RDF = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"
 METHOD = "estimated by Placewise"
 TRUE_NORTH = "T"  # GPSImgDirectionRef: not the magnetic one
 EMPTY_SIDECAR = f"""<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
@@ -31,37 +24,11 @@ EMPTY_SIDECAR = f"""<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 </x:xmpmeta>
 <?xpacket end="w"?>
 """.encode()
-COORDINATE = re.compile(r"(\d{1,3}),(\d+(?:\.\d+)?)(?:,(\d+(?:\.\d+)?))?([NSEW])")
-
-
-def find_sidecar(photo: Path) -> Path | None:
-    """Return the sidecar of a photo: `IMG_1.jpg.xmp`, or else `IMG_1.xmp`; None if none exists."""
-    names = (sidecar_path(photo), photo.with_suffix(".xmp"))
-    return next((path for path in names if os.path.isfile(path)), None)  # noqa: PTH113 any length
 
 
 def sidecar_path(photo: Path) -> Path:
     """Return the path of the XMP sidecar that is written for a photo: `IMG_1.jpg.xmp`."""
     return photo.with_name(f"{photo.name}.xmp")
-
-
-def embedded_xmp(file: BinaryIO) -> bytes | None:
-    """Return the XMP in a JPEG, PNG, WebP or TIFF photo; None if there is none."""
-    try:
-        return read_structure(file).xmp
-    except PHOTO_READ_ERRORS:
-        return None
-
-
-def read_position(xmp: bytes) -> tuple[float, float] | None:
-    """Return (latitude, longitude) in degrees; None if there are none, or they can't be read."""
-    try:
-        values = _exif_properties(xmp)
-    except ElementTree.ParseError:
-        return None
-    latitude = _parse_degrees(values.get("GPSLatitude"))
-    longitude = _parse_degrees(values.get("GPSLongitude"))
-    return None if latitude is None or longitude is None else (latitude, longitude)
 
 
 def add_position(
@@ -84,9 +51,9 @@ def add_position(
     """
     data = existing or EMPTY_SIDECAR
     try:
-        there = _exif_properties(data)
+        there = read_xmp(data)
         offset, about = _end_of_rdf(data)
-    except (ElementTree.ParseError, expat.ExpatError, ValueError) as error:
+    except (expat.ExpatError, ValueError) as error:
         raise Unprocessable("bad_sidecar", f"The sidecar can't be edited: {error}.") from error
     if {"GPSLatitude", "GPSLongitude"} & there.keys():
         raise Unprocessable("has_coordinates", "The sidecar has coordinates already.")
@@ -118,17 +85,6 @@ def hundredths(value: float) -> str:
     return f"{round(100 * value)}/100"
 
 
-def _exif_properties(xmp: bytes) -> dict[str, str]:
-    """Return the properties of the EXIF schema, as attributes or elements."""
-    prefix, values = f"{{{EXIF}}}", {}
-    for element in ElementTree.fromstring(xmp).iter():  # noqa: S314 Expat bounds entities
-        pairs = [*element.attrib.items(), (element.tag, element.text or "")]
-        values.update(
-            {name.removeprefix(prefix): text for name, text in pairs if name.startswith(prefix)}
-        )
-    return values
-
-
 def _end_of_rdf(xmp: bytes) -> tuple[int, str]:
     """Return the offset of the end tag of rdf:RDF in bytes, and what its content is about."""
     xmp.decode("utf-8")  # offsets and what is inserted are UTF-8
@@ -154,11 +110,3 @@ def _end_of_rdf(xmp: bytes) -> tuple[int, str]:
 def _format_degrees(degrees: float, letters: str) -> str:
     whole, minutes = divmod(round(abs(degrees) * 60, 6), 60)
     return f"{whole:.0f},{minutes:.6f}{letters[degrees < 0]}"
-
-
-def _parse_degrees(text: str | None) -> float | None:
-    match = COORDINATE.fullmatch((text or "").strip())
-    if match is None:
-        return None
-    degrees = float(match[1]) + float(match[2]) / 60 + float(match[3] or 0) / 3600
-    return -degrees if match[4] in "SW" else degrees

@@ -18,12 +18,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from xml.etree import ElementTree
 
+from services.cli.ingest.local_headers import find_sidecars
 from services.cli.locate.folder import FolderPhoto, read_photo
 from services.cli.locate.sidecars import (
     METHOD,
     TRUE_NORTH,
     add_position,
-    find_sidecar,
     hundredths,
     sidecar_path,
 )
@@ -57,6 +57,8 @@ class LocatedPhoto:
     place_probability: float | None
     error: str | None
     """why the photo could not be searched"""
+    why_unknown: str = ""
+    """what is shown if there is no proposal"""
 
     @property
     def probability(self) -> float:
@@ -129,7 +131,7 @@ def _change_meanwhile(folder: Path, photo: Path) -> str | None:
     """Return why a photo needs no position any more; the searches may have taken minutes."""
     if not photo.exists():
         return "was moved or deleted meanwhile"
-    if read_photo(folder, photo).latitude is not None:
+    if not read_photo(folder, photo).is_unlocated:
         return "got coordinates meanwhile"
     return None
 
@@ -152,7 +154,7 @@ def _photo_writer(target: Target) -> Callable[[UndoJournal, Path, Proposal], Pat
 
 
 def _write_sidecar(journal: UndoJournal, photo: Path, proposal: Proposal) -> Path:
-    there = find_sidecar(photo)
+    there = next(iter(find_sidecars(photo)), None)
     path = there or sidecar_path(photo)
     content = add_position(
         there.read_bytes() if there else None,
@@ -226,7 +228,7 @@ def write_exif(writer: ExifWriter, photo: Path, proposal: Proposal) -> None:
     Raises:
         Unprocessable: `exif_not_written`.
     """
-    if _read_header(photo).heading is not None:
+    if _read_header(photo).has_heading:
         proposal = replace(proposal, heading=None)
     writer(photo, proposal)
     header = _read_header(photo)

@@ -141,7 +141,7 @@ def _check_weights(config: ExtractorConfig, settings: Settings) -> str:
                 f"{config.name}: weights {path} ({path.stat().st_size / 1e9:.1f} GB) match; no "
                 "shipped vocabulary: photos are described once one is fitted or imported"
             )
-    from services.cli.descriptors.local_extractor import load_extractor
+    from services.cli.descriptors.load_extractor import load_extractor
 
     extractor = load_extractor(config, settings)
     shipped = extractor.shipped_vocabulary()

@@ -3,23 +3,33 @@
 from __future__ import annotations
 
 import contextlib
+import math
+import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 
-from services.cli.ingest.geotags import list_photos
-from services.cli.output import print_note, printable_path, utf8_path
-from shared.errors import InvalidRequest, Misconfigured, PlacewiseError
-from shared.imaging.photo_header import PhotoHeader, read_photo_header
+from services.cli.locate.folder import read_folder
+from services.cli.output import print_note, printable_path
+from shared.errors import InvalidRequest, Misconfigured
 
 UNKNOWN_BEGIN = datetime.fromtimestamp(0, UTC)  # the time of a file is that of its last copy
-MAX_HEADER_PIXELS = 2**31  # only headers are read here; the server has a limit of its own
 MIN_STEP = timedelta(milliseconds=1)  # between photos whose clocks show the same time
+ROUNDING_SECONDS = 1e-6
 JPEG_QUALITY = 92  # of the frames of a video
+NO_TIMESTAMPS = 0x80  # FFmpeg's AVFMT_NOTIMESTAMPS: a raw stream, such as .h264
+COUNTERCLOCKWISE = (
+    None,
+    Image.Transpose.ROTATE_90,
+    Image.Transpose.ROTATE_180,
+    Image.Transpose.ROTATE_270,
+)
+"""Of an image, by quarter turns"""
 
 
 class Order(StrEnum):
@@ -57,8 +67,8 @@ def read_photo_frames(folder: Path, timing: FrameTiming) -> list[SourceFrame]:
     Raises:
         InvalidRequest: `no_photos`; `no_times` if a photo of `Order.TIME` has no time.
     """
-    photos = [(path, _header_of(path)) for path in list_photos(folder)]
-    without_time = next((path for path, header in photos if header.captured_at is None), None)
+    photos = read_folder(folder, None, 0.0)
+    without_time = next((photo.path for photo in photos if photo.time is None), None)
     if timing.order == Order.TIME and without_time is not None:
         raise InvalidRequest(
             "no_times",
@@ -71,21 +81,23 @@ def read_photo_frames(folder: Path, timing: FrameTiming) -> list[SourceFrame]:
         _print_clock(timing.begin, None, "photos in the order of their names")
     frames = [
         SourceFrame(
-            path,
-            utf8_path(path.relative_to(folder)),
+            photo.path,
+            photo.name,
             first + timedelta(seconds=number * timing.every_seconds)
-            if by_name or header.captured_at is None
-            else header.captured_at,
-            header.latitude,
-            header.longitude,
+            if by_name or photo.time is None
+            else photo.time,
+            photo.latitude,
+            photo.longitude,
         )
-        for number, (path, header) in enumerate(photos)
+        for number, photo in enumerate(photos)
     ]
     return _with_distinct_times(sorted(frames, key=lambda frame: frame.captured_at))
 
 
 def read_video_frames(video: Path, timing: FrameTiming, folder: Path) -> Iterator[SourceFrame]:
     """Decode a frame of a video every `timing.every_seconds` and write it to a folder as JPEG.
+
+    Frames are turned as players turn them. Those of a raw stream have times by its frame rate.
 
     Raises:
         Misconfigured: `no_video_decoder`.
@@ -110,16 +122,15 @@ def read_video_frames(video: Path, timing: FrameTiming, folder: Path) -> Iterato
             recorded = _parse_created(container.metadata.get("creation_time"))
             first = timing.begin or recorded or UNKNOWN_BEGIN
             _print_clock(timing.begin, recorded, "the video")
-            begin = due = 0.0
-            for number, frame in enumerate(container.decode(video=0)):
-                if number == 0:
-                    begin = frame.time or 0.0
-                seconds = (frame.time or 0.0) - begin
-                if seconds < due - 1e-6:
+            tagged = container.streams.video[0].metadata.get("rotate", "0")
+            due = 0.0
+            for seconds, frame in _with_seconds(container):
+                if seconds < due - ROUNDING_SECONDS:
                     continue
-                due += timing.every_seconds * (1 + (seconds - due) // timing.every_seconds)
+                steps = 1 + (seconds - due + ROUNDING_SECONDS) // timing.every_seconds
+                due += timing.every_seconds * steps
                 path = folder / f"frame-{seconds:010.3f}.jpg"
-                Image.fromarray(frame.to_ndarray(format="rgb24")).save(path, quality=JPEG_QUALITY)
+                _upright(frame, tagged).save(path, quality=JPEG_QUALITY)
                 yield SourceFrame(path, path.name, first + timedelta(seconds=seconds))
     except av.FFmpegError as error:
         raise InvalidRequest(
@@ -127,11 +138,44 @@ def read_video_frames(video: Path, timing: FrameTiming, folder: Path) -> Iterato
         ) from error
 
 
-def _header_of(path: Path) -> PhotoHeader:
-    # The server names what is wrong with a photo that can't be read.
-    with contextlib.suppress(PlacewiseError, OSError), path.open("rb") as file:
-        return read_photo_header(file, MAX_HEADER_PIXELS)
-    return PhotoHeader(0, 0)
+def _with_seconds(container: Any) -> Iterator[tuple[float, Any]]:
+    """Yield the frames of a video with their times after the first one.
+
+    A frame without a time follows the one before after a frame's duration.
+    """
+    stream = container.streams.video[0]
+    rate = float(stream.codec_context.framerate or stream.guessed_rate or 25)  # FFmpeg's default
+    is_raw = bool(container.format.flags & NO_TIMESTAMPS)
+    if is_raw:
+        print_note(f"The video has no times: {rate:g} frames a second are assumed.")
+    begin = None
+    seconds = -1 / rate
+    for frame in container.decode(stream):
+        time = None if is_raw else frame.time
+        begin = time if begin is None else begin
+        seconds = seconds + 1 / rate if time is None or begin is None else time - begin
+        yield seconds, frame
+
+
+def _upright(frame: Any, tagged: str) -> Image.Image:
+    """Return a frame as players show it.
+
+    Args:
+        frame: A frame with a display matrix (x' = a x + c y, y' = b x + d y) or without.
+        tagged: Degrees clockwise by which older files without one say that it is to be turned.
+    """
+    image = Image.fromarray(frame.to_ndarray(format="rgb24"))
+    matrix = next((each for each in frame.side_data if each.type.name == "DISPLAYMATRIX"), None)
+    if matrix is None:
+        quarters = -round(float(tagged) / 90) if tagged.lstrip("-").isdigit() else 0
+    else:
+        a, b, _, c, d = struct.unpack_from("<5i", bytes(matrix))
+        if a * d < b * c:
+            image = image.transpose(Image.Transpose.FLIP_LEFT_RIGHT)
+            a, b = -a, -b
+        quarters = round(math.atan2(-b, a) / (math.pi / 2))
+    turn = COUNTERCLOCKWISE[quarters % 4]
+    return image if turn is None else image.transpose(turn)
 
 
 def _with_distinct_times(frames: list[SourceFrame]) -> list[SourceFrame]:

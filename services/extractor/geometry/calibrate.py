@@ -17,7 +17,7 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.geometry.cameras import CameraSource, Floats
+from shared.geometry.cameras import Camera, CameraSource, Floats
 from shared.geometry.component import Component, bounded_inverse, projection_jacobian
 from shared.geometry.frames import MIN_AGREEING_SHARE, Alignment, Similarity
 from shared.geometry.localise import LocalPose, localise
@@ -90,7 +90,7 @@ def localise_left_out(
         descriptors: (n, D) L2-normalised, of the component's photos in their order.
         seconds: (n,) when they were taken; NaN where that is unknown.
         focal_lengths: (n,) of EXIF, as multiples of the longer side; None without. With one, the
-            camera of a query is that of the model.
+            camera of a query is that of the model, unless it was imported without a key.
         similarity: Of the component, if it is aligned.
         on_progress: Called with the number of photos that are done; what it raises ends the work.
     """
@@ -103,13 +103,13 @@ def localise_left_out(
         similarities = np.where(near, -np.inf, descriptors @ descriptors[row])
         best = np.argsort(-similarities, kind="stable")[: min(CANDIDATES, int((~near).sum()))]
         photo = component.photo_ids[row]
-        camera = component.cameras[component.camera_numbers[row]] if focal_lengths[row] else None
+        camera, source = _query_camera(component, row, features[photo], focal_lengths[row])
         found = localise(
             _with_noise(component, row, features[photo]),
             [(component.photo_ids[i], features[component.photo_ids[i]]) for i in best.tolist()],
             [_without(component, np.flatnonzero(near), features)],
             camera,
-            CameraSource.MAP if camera else CameraSource.ESTIMATED,
+            source,
             matcher,
             frozenset(component.photo_ids[i] for i in np.flatnonzero(near).tolist()),
         )
@@ -123,18 +123,34 @@ def localise_left_out(
     return done
 
 
+def _query_camera(
+    component: Component, row: int, query: LocalFeatures, focal_length: float | None
+) -> tuple[Camera | None, CameraSource]:
+    """Return the camera that a query of the same camera as a photo would have."""
+    camera, size = component.cameras[component.camera_numbers[row]], (query.width, query.height)
+    if focal_length if camera.rays is None else any(camera.rays.camera_key):
+        return camera.resized(*size), CameraSource.MAP
+    if focal_length is None:
+        return None, CameraSource.ESTIMATED
+    return Camera.of_focal_length(*size, focal_length), CameraSource.EXIF
+
+
 def _errors(
     component: Component, row: int, features: LocalFeatures
 ) -> tuple[NDArray[np.int32], Floats]:
     """Return the points that a photo sees, and (m, 2) how far its keypoints are from them.
 
-    In pixels at WORKING_SIDE.
+    In pixels at WORKING_SIDE, undistorted. Keypoints whose ray the camera does not know are left
+    out.
     """
     numbers = component.point_numbers[row]
     camera, is_point = component.cameras[component.camera_numbers[row]], numbers >= 0
     seen = component.points[numbers[is_point]] @ component.rotation(row).T
-    errors = features.pixels()[is_point] - camera.project(seen + component.translations[row])
-    return numbers[is_point], errors * (WORKING_SIDE / max(camera.width, camera.height))
+    pixels = camera.undistort(features.pixels()[is_point])
+    errors = pixels - camera.project(seen + component.translations[row])
+    is_known = np.isfinite(errors).all(axis=1)
+    scale = WORKING_SIDE / max(camera.width, camera.height)
+    return numbers[is_point][is_known], errors[is_known] * scale
 
 
 def _with_noise(component: Component, row: int, features: LocalFeatures) -> LocalFeatures:

@@ -10,6 +10,7 @@ last one. All but the reading runs in child processes of low priority.
 from __future__ import annotations
 
 import hashlib
+import sys
 import threading
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -56,12 +57,13 @@ from shared.catalog.reconstructions import (
     current_reconstruction,
 )
 from shared.errors import NotFound, Unprocessable
-from shared.geometry.cameras import Floats
+from shared.geometry.cameras import Floats, Rays, hash_camera_key
 from shared.geometry.colmap_model import ColmapModel
 from shared.geometry.component import Component
 from shared.geometry.frames import GPS_SIGMA_M, Alignment, align, plane_at
 from shared.geometry.radius import PoseCalibration
 from shared.ids import new_id
+from shared.imaging.photo_header import read_photo_header
 from shared.jobs import Job
 from shared.jobs.leases import lock_leased_job
 from shared.jobs.progress import JobProgress
@@ -76,7 +78,7 @@ from shared.storage.keys import component_key, matches_key, reconstruction_prefi
 
 PROGRESS_UNITS = 100
 MATCHED, MAPPED = 40, 80  # units of progress after these steps
-MAX_NAMES_REPORTED = 100  # photos that are left out, names of an imported model without a photo
+MAX_NAMES_REPORTED = 100  # photos in no component, names of an imported model without a photo
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,8 +120,7 @@ class ReconstructionJob:
             model, unmatched = self._read_model(photos)
             names = model.names()
             photos = {id_: photo for id_, photo in photos.items() if str(id_) in names}
-            result["unmatched"] = len(unmatched)
-            result["unmatched_names"] = unmatched[:MAX_NAMES_REPORTED]
+            result |= _names_result("unmatched", unmatched)
         matches = self._match(made, photos)
         components = self._load_components(made, photos)
         if components is None:
@@ -213,7 +214,8 @@ class ReconstructionJob:
         if known is not None:
             matches = _join_matches(matches, known)
         self._store.put(key, matches.encode())
-        self._end_step()
+        with self._catalog.write() as session:
+            self._end_step(session)
         return matches
 
     def _read_sections(self, photos: dict[UUID, MapPhoto]) -> list[str | None]:
@@ -260,6 +262,7 @@ class ReconstructionJob:
             photo.to_map(position)
             for photo, position in zip(photos.values(), _positions(photos.values()), strict=True)
         ]
+        known: dict[UUID, Rays] = {}
         self._progress.update(MATCHED, "map")
 
         def report(tried: int) -> None:
@@ -272,21 +275,33 @@ class ReconstructionJob:
             if model is None:
                 current = self._find_extendable(photos)
                 existing = self._fetch_models(Path(scratch), current) if current else []
+                for each in current.list_components() if current else []:
+                    known |= Component.decode(self._store.get(each.object_key)).rays()
                 found = map_photos(to_map, matches, folder, report, self._progress.check, existing)
             else:
                 source = Path(scratch, "model")
                 source.mkdir()
                 model.write(source)
                 names = {name: UUID(name) for name in model.names()}
+                to_map = [self._with_header(photo, photos[photo.id].row) for photo in to_map]
                 found = import_model(to_map, names, matches, folder, source, self._progress.check)
+            if known:
+                found = [replace(one, component=one.component.with_rays(known)) for one in found]
             stored = [
                 self._store_component(made.id, number, each) for number, each in enumerate(found)
             ]
         with self._catalog.write() as session:
-            self._lock(session)
+            self._end_step(session)
             made = session.get_one(Reconstruction, made.id)
             made.components = [each.model_dump(mode="json") for each in stored]
         return made, [each.component for each in found]
+
+    def _with_header(self, to_map: PhotoToMap, photo: Photo) -> PhotoToMap:
+        """Return a photo of an imported model with what its file says about its camera."""
+        with self._store.open(photo.object_key) as file:
+            header = read_photo_header(file, sys.maxsize)
+        camera = hash_camera_key(header.camera_key) if header.camera_key else to_map.camera
+        return replace(to_map, quarter_turns=header.quarter_turns, camera=camera)
 
     def _fetch_models(self, scratch: Path, current: Reconstruction) -> list[Path]:
         """Write the COLMAP models of a reconstruction into folders."""
@@ -386,7 +401,7 @@ class ReconstructionJob:
         )
         result |= {
             "reconstructed": len(photos) - len(left_out),
-            "left_out_names": names[:MAX_NAMES_REPORTED],
+            **_names_result("left_out", names),
             "components": len(stored),
             "aligned": sum(each.alignment is not None for each in stored),
             "proposals": len(proposals),
@@ -430,10 +445,9 @@ class ReconstructionJob:
             calibrate_components, parts, matcher, on_progress=report, check=self._progress.check
         )
 
-    def _end_step(self) -> None:
+    def _end_step(self, session: Session) -> None:
         """Note that a step is stored: workers that died before it do not count any more."""
-        with self._catalog.write() as session:
-            self._lock(session).attempts = 0
+        self._lock(session).attempts = 0
 
     def _lock(self, session: Session) -> Job:
         leased = lock_leased_job(session, self._job)
@@ -503,6 +517,11 @@ def _to_json(proposal: CoordinateProposal, photo: Photo) -> dict[str, Any]:
         "distance_m": proposal.distance_m,
         "radius_95_m": proposal.radius_95_m,
     }
+
+
+def _names_result(what: str, names: list[str]) -> dict[str, Any]:
+    """Return the fields of a job's result for names of photos or of an imported model."""
+    return {what: len(names), f"{what}_names": names[:MAX_NAMES_REPORTED]}
 
 
 def _join_matches(new: VerifiedMatches, known: VerifiedMatches) -> VerifiedMatches:

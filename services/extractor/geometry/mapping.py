@@ -12,6 +12,7 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import MappingProxyType
 from typing import Any
 from uuid import UUID
 
@@ -23,7 +24,7 @@ from services.extractor.geometry.evidence import without_contradictions
 from services.extractor.geometry.matching import VerifiedMatches
 from services.extractor.geometry.positions import adjust_to_positions, misplaced_photos
 from shared.errors import Misconfigured, Unprocessable
-from shared.geometry.cameras import UNKNOWN_FOCAL_LENGTH, Camera, Floats
+from shared.geometry.cameras import UNKNOWN_FOCAL_LENGTH, Camera, Floats, Rays
 from shared.geometry.component import (
     NO_POINT,
     Component,
@@ -45,6 +46,8 @@ POOR_SHARE = 0.5
 ENOUGH_SHARE = 0.9
 """of the photos in the largest component: a second run would add little"""
 RANDOM_SEED = 1
+DISTORTION_VECTORS = (("p2", "p1"), ("sx1", "sy1"), ("p0", "p1"), ("s0", "s2"), ("s1", "s3"))
+"""Parameters of camera models that are the x and y of a vector in the plane of the photo"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +65,10 @@ class PhotoToMap:
     """(3,) metres east, north and up in a plane of all photos; up is NaN without an altitude"""
     trusts_focal_length: bool = True
     """whether the reconstruction begins with `focal_length`"""
+    quarter_turns: int | None = 0
+    """`PhotoHeader.quarter_turns`; only imports look at it"""
+    camera: bytes = bytes(32)
+    """`hash_camera_key`, of imported photos; zero bytes if it is not known"""
 
     @property
     def camera_key(self) -> tuple[int, int, float]:
@@ -116,8 +123,9 @@ def import_model(
 ) -> list[MappedComponent]:
     """Serve an existing COLMAP or hloc model: triangulate our keypoints from its camera poses.
 
-    Images whose camera has another shape than the photo, for example because the photo is stored
-    turned, are left out.
+    COLMAP reads photos as they lie, and Placewise upright: poses and cameras are turned by the
+    photos' EXIF, unless more matches agree with poses of upright photos. Images whose camera has
+    another shape than the photo are left out.
 
     Args:
         photos: The photos of the model.
@@ -243,8 +251,16 @@ def _map(
                     _deregister(each, misplaced)
                 break
             matches = matches.only(~wrong)
-        found += anew
-        return _write_models(photos, found, folder)
+        plausible = [each for each in anew if _bent_focal_length(each) is None]
+        if anew and not found and not plausible:
+            raise Unprocessable(
+                "empty_model",
+                "No photos could be reconstructed together: their matches agree with a focal "
+                f"length of {_bent_focal_length(anew[0]):.2f} longer sides only, which hardly a "
+                "camera has. Send photos as the camera took them, neither cropped nor with a "
+                "changed perspective.",
+            )
+        return _write_models(photos, found + plausible, folder)
 
 
 def _registered(models: Sequence[Any]) -> int:
@@ -302,33 +318,91 @@ def _triangulate(
         raise Unprocessable(
             "unreadable_model", f"{path.name} is no COLMAP model: {error}"
         ) from error
-    of_id = {photo.id: photo for photo in photos}
+    by_name = {name: photo for photo in photos for name, id_ in names.items() if id_ == photo.id}
+    models = [_turned_model(pycolmap, imported, by_name)]
+    if any(photo.quarter_turns != 0 for photo in photos):
+        upright = {name: replace(photo, quarter_turns=0) for name, photo in by_name.items()}
+        models.append(_turned_model(pycolmap, imported, upright))
+    models = [(model, rays) for model, rays in models if model.num_reg_images()]
+    if not models:
+        raise Unprocessable(
+            "empty_model",
+            "No image of the model has the name of a photo of the map, and its shape.",
+        )
+    found = []
+    for model, rays in models:
+        with TemporaryDirectory(prefix="placewise-map-") as scratch:
+            database = Path(scratch) / "database.db"
+            _write_database(pycolmap, photos, matches, database, [model])
+            made = pycolmap.triangulate_points(model, str(database), scratch, scratch)
+            found.append((made, rays))
+    best, rays = max(found, key=lambda each: each[0].compute_num_observations())
+    return _write_models(photos, [best], folder, rays)
+
+
+def _turned_model(
+    pycolmap: Any, imported: Any, photos: Mapping[str, PhotoToMap]
+) -> tuple[Any, dict[int, Rays]]:
+    """Return the poses of photos after their turns, without points, and the rays by camera."""
     model = pycolmap.Reconstruction()
+    camera_ids: dict[tuple[int, int, bytes], int] = {}
+    rays = {}
     for number in sorted(imported.reg_image_ids()):
         image = imported.image(number)
-        photo, camera = of_id.get(names.get(image.name, UUID(int=0))), image.camera
-        if photo is None or not _has_shape(photo, camera):
+        photo = photos.get(image.name)
+        if photo is None or photo.quarter_turns is None:
             continue
-        if not model.exists_camera(image.camera_id):
-            scaled = pycolmap.Camera(camera.todict())
-            _resize(scaled, _working_scale(camera))
-            model.add_camera_with_trivial_rig(scaled)
+        key = image.camera_id, photo.quarter_turns, photo.camera
+        camera = turned_camera(pycolmap, image.camera, photo.quarter_turns)
+        if not _has_shape(photo, camera):
+            continue
+        if key not in camera_ids:
+            camera.camera_id = camera_ids[key] = len(camera_ids) + 1
+            rays[camera.camera_id] = Rays.fit(
+                camera.cam_ray_from_img,
+                (camera.width, camera.height),
+                camera.mean_focal_length() / max(camera.width, camera.height),
+                photo.camera,
+                photo.quarter_turns,
+            )
+            _resize(camera, _working_scale(camera))
+            model.add_camera_with_trivial_rig(camera)
         ours = pycolmap.Image(
             name=str(photo.id),
             keypoints=_working_pixels(photo).astype(float),
-            camera_id=image.camera_id,
+            camera_id=camera_ids[key],
             image_id=number,
         )
-        model.add_image_with_trivial_frame(ours, image.cam_from_world())
-    if not model.num_reg_images():
-        raise Unprocessable(
-            "empty_model", "No image of the model has the name of a photo of the map."
-        )
-    with TemporaryDirectory(prefix="placewise-map-") as scratch:
-        database = Path(scratch) / "database.db"
-        _write_database(pycolmap, photos, matches, database, [model])
-        found = pycolmap.triangulate_points(model, str(database), scratch, scratch)
-        return _write_models(photos, [found], folder)
+        turn = np.eye(3)
+        turn[:2, :2] = _turn(photo.quarter_turns)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.zeros(3)) * image.cam_from_world()
+        model.add_image_with_trivial_frame(ours, pose)
+    return model, rays
+
+
+def _turn(quarter_turns: int) -> NDArray[np.float64]:
+    """Return the (2, 2) matrix that turns x right, y down clockwise."""
+    found = np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), quarter_turns)
+    return np.asarray(found)
+
+
+def turned_camera(pycolmap: Any, camera: Any, quarter_turns: int) -> Any:
+    """Return a copy of a camera of any model of COLMAP for photos that are turned clockwise."""
+    turned = pycolmap.Camera(camera.todict())
+    names = camera.params_info.split(", ")
+    values = dict(zip(names, np.array(camera.params).tolist(), strict=True))
+    middle = np.array([camera.width, camera.height]) / 2
+    if quarter_turns % 2:
+        turned.width, turned.height = camera.height, camera.width
+        values |= {"fx": values.get("fy", 0), "fy": values.get("fx", 0)}
+    centre = _turn(quarter_turns) @ (np.array([values["cx"], values["cy"]]) - middle)
+    centre += np.array([turned.width, turned.height]) / 2
+    values |= {"cx": centre[0], "cy": centre[1]}
+    for x, y in DISTORTION_VECTORS:
+        if x in values and y in values:
+            values[x], values[y] = _turn(quarter_turns) @ [values[x], values[y]]
+    turned.params = [values[name] for name in names]
+    return turned
 
 
 def _has_shape(photo: PhotoToMap, camera: Any) -> bool:
@@ -430,8 +504,16 @@ def _resized(model: Any, scales: Mapping[int, float]) -> Any:
     return model
 
 
-def _write_models(photos: Sequence[PhotoToMap], models: Sequence[Any], folder: Path) -> list[float]:
-    """Write models at the photos' sizes with their components, the one with most photos first."""
+def _write_models(
+    photos: Sequence[PhotoToMap],
+    models: Sequence[Any],
+    folder: Path,
+    rays: Mapping[int, Rays] = MappingProxyType({}),
+) -> list[float]:
+    """Write models at the photos' sizes with their components, the one with most photos first.
+
+    `rays` are those of imported cameras.
+    """
     by_name = {str(photo.id): photo for photo in photos}
     errors = []
     for number, model in enumerate(_without_shared_photos(models)):
@@ -441,6 +523,10 @@ def _write_models(photos: Sequence[PhotoToMap], models: Sequence[Any], folder: P
             photo = by_name[image.name]
             scales[image.camera_id] = max(photo.width, photo.height) / WORKING_SIDE
         component = _component_of(model, by_name, scales)
+        if rays:
+            names = {image.name: image.camera_id for image in model.images.values()}
+            known = {id_: rays[names[str(id_)]] for id_ in component.photo_ids}
+            component = component.with_rays(known)
         (folder / f"{number}.npz").write_bytes(component.encode())
         _resized(model, scales)
         for image in model.images.values():  # exactly, and not as the rounded sides are scaled
@@ -449,24 +535,18 @@ def _write_models(photos: Sequence[PhotoToMap], models: Sequence[Any], folder: P
         (folder / str(number)).mkdir()
         model.write(str(folder / str(number)))
     if not errors:
-        reason = "too few matches agree with each other."
-        bent = [
-            camera for m in models for camera in m.cameras.values() if not _is_plausible(camera)
-        ]
-        if bent:
-            focal = bent[0].mean_focal_length() / max(bent[0].width, bent[0].height)
-            reason = (
-                f"their matches agree with a focal length of {focal:.2f} longer sides only, which "
-                "hardly a camera has. Send photos as the camera took them, neither cropped nor "
-                "with a changed perspective."
-            )
-        raise Unprocessable("empty_model", f"No photos could be reconstructed together: {reason}")
+        raise Unprocessable(
+            "empty_model",
+            "No photos could be reconstructed together: too few matches agree with each other.",
+        )
     return errors
 
 
-def _is_plausible(camera: Any) -> bool:
+def _bent_focal_length(model: Any) -> float | None:
+    """Return a focal length of a model, in longer sides, that hardly a camera has: it is bent."""
     low, high = PLAUSIBLE_FOCAL_LENGTHS
-    return bool(low <= camera.mean_focal_length() / max(camera.width, camera.height) <= high)
+    found = (c.mean_focal_length() / max(c.width, c.height) for c in model.cameras.values())
+    return next((float(each) for each in found if not low <= each <= high), None)
 
 
 def _deregister(model: Any, names: AbstractSet[str]) -> None:
@@ -478,15 +558,12 @@ def _deregister(model: Any, names: AbstractSet[str]) -> None:
 def _without_shared_photos(models: Sequence[Any]) -> list[Any]:
     """Return the models, most photos first, each without the photos of those before it.
 
-    pycolmap lets the models of one run overlap. A photo in two frames would have two poses. Models
-    with a focal length that hardly a camera has are bent, and left out.
+    pycolmap lets the models of one run overlap. A photo in two frames would have two poses.
     """
     disjoint: list[Any] = []
     names: set[str] = set()
     for model in sorted(models, key=lambda model: -model.num_reg_images()):
         _deregister(model, names)
-        if not all(map(_is_plausible, model.cameras.values())):
-            continue
         is_enough = model.num_reg_images() >= MIN_MODEL_PHOTOS
         if is_enough and model.num_points3D() >= MIN_MODEL_POINTS:
             disjoint.append(model)

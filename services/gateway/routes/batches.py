@@ -36,6 +36,7 @@ from services.gateway.schemas import (
 from services.gateway.uploads.batch import (
     FILES_FIELD,
     MANIFEST_FIELD,
+    MAX_PREFIX_BYTES,
     NDJSON_MEDIA_TYPES,
     PREFIX_FIELD,
     BatchFile,
@@ -47,10 +48,12 @@ from services.gateway.uploads.batch import (
 from shared.catalog.batch_items import BatchSource, add_batch_items, create_batch, list_batch_items
 from shared.catalog.jobs import get_job
 from shared.catalog.maps import get_map
+from shared.config.gateway_settings import MAX_BATCH_PHOTOS
 from shared.config.settings import Settings
 from shared.errors import Conflict, PlacewiseError, Unprocessable, invalid_field_error
 from shared.ingest.photo_metadata import (
     KEY_FIELD,
+    MAX_MANIFEST_BYTES,
     MAX_REPORTED_LINES,
     ManifestEntry,
     bad_lines_error,
@@ -66,6 +69,7 @@ BATCH_UPLOAD_PATH = "/upload/batch"
 _BINARY_SCHEMA = {"type": "string", "format": "binary"}
 _MANIFEST_SCHEMA = {
     "type": "string",
+    "maxLength": MAX_MANIFEST_BYTES,
     "description": "JSON lines: `filename` (of a file of the form) or `key` (of an object below "
     "`imports/`), and any of the fields of `POST /upload`",
 }
@@ -79,12 +83,14 @@ REQUEST_BODY = {
                     "properties": {
                         FILES_FIELD: {
                             "type": "array",
+                            "maxItems": MAX_BATCH_PHOTOS,
                             "items": _BINARY_SCHEMA,
                             "description": "photos",
                         },
                         MANIFEST_FIELD: _MANIFEST_SCHEMA,
                         PREFIX_FIELD: {
                             "type": "string",
+                            "maxLength": MAX_PREFIX_BYTES,
                             "description": "imports all photos below this key prefix, which must "
                             "be below `imports/`; also accepted as s3://S3_BUCKET/...",
                         },
@@ -123,7 +129,7 @@ class BatchItemsResponse(ResponseModel):
 
 class BatchItemsParams(MapPageParams):
     limit: int = Field(100, ge=1, le=1000)
-    state: list[JobState] | None = None
+    state: list[JobState] | None = Field(None, max_length=len(JobState))
 
 
 @router.post(
@@ -219,8 +225,11 @@ def _plan_items(
     gateway: GatewayContext, received: BatchUpload
 ) -> tuple[list[dict[str, Any]], BatchSource, dict[str, Any]]:
     """Return the items as column values of BatchItem, their source, and the job params."""
+    max_photos = gateway.settings.max_batch_photos
     if received.files:
-        entries = read_jsonl_manifest(received.manifest or b"", "the manifest")
+        entries = read_jsonl_manifest(
+            received.manifest or b"", "the manifest", max_entries=max_photos
+        )
         return list(_form_file_items(received.files, entries)), BatchSource.FILES, {}
     if received.prefix is not None:
         return (
@@ -228,12 +237,14 @@ def _plan_items(
             BatchSource.PREFIX,
             {"prefix": validate_prefix(received.prefix, gateway.settings)},
         )
-    entries = read_jsonl_manifest(received.manifest or b"", "the manifest", (KEY_FIELD,))
+    entries = read_jsonl_manifest(
+        received.manifest or b"", "the manifest", (KEY_FIELD,), max_photos
+    )
     _validate_keys(entries)
     if not entries:
         raise Unprocessable("no_photos", "The manifest has no lines.")
-    if len(entries) > gateway.settings.max_batch_photos:
-        raise too_many_photos_error(gateway.settings.max_batch_photos)
+    if len(entries) > max_photos:
+        raise too_many_photos_error(max_photos)
     rows = [
         {"name": entry.name, "object_key": entry.name, "fields": entry.fields, "line": entry.line}
         for entry in entries

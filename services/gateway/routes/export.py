@@ -114,7 +114,7 @@ def export_descriptors(
     size = len(header) + rows * generation.dimension * np.dtype(np.float32).itemsize
     members = [("photos.csv", table.tell()), ("names.txt", names.tell()), ("descriptors.npy", size)]
     sizes = [size_bytes for chunk in chunks for size_bytes in chunk.feature_sizes]
-    index = encode_feature_index(model or "none", sizes)
+    index = encode_feature_index(model or "none", sizes, "local.features")
     if query.features:
         members.append(("local.features", len(index) + sum(sizes)))
 

@@ -26,6 +26,7 @@ from shared.catalog.maps import (
 from shared.catalog.processes import PROCESS_TIMEOUT_SECONDS, list_processes
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, StorageFull, TooManyRequests
+from shared.jobs.queue_depth import QueueDepth
 from shared.storage.trash import read_hold
 
 probe_router = APIRouter(tags=["operations"])
@@ -69,10 +70,18 @@ class ExtractorProcess(ResponseModel):
     )
 
 
+class QueueStatus(ComponentStatus):
+    """The job queue. `degraded`: Redis takes no messages; jobs are found a little later."""
+
+    oldest_waiting_seconds: float = Field(description="age of the oldest job that waits; 0: none")
+    finished_in_last_minute: int = Field(description="photos and queries, also failed ones")
+
+
 class ExtractorsStatus(ComponentStatus):
     """Whether photos can be described.
 
-    `degraded`: no extractor is alive, or a map's extractor can't be loaded.
+    `degraded`: no extractor is alive, a map's extractor can't be loaded, or a job waits much longer
+    than usual while none is finished.
     """
 
     processes: list[ExtractorProcess] = Field(description="extractors with a recent heartbeat")
@@ -111,7 +120,7 @@ class HealthResponse(ResponseModel):
     status: str
     version: str
     uptime_seconds: float
-    parts: dict[str, ExtractorsStatus | ComponentStatus]
+    parts: dict[str, ExtractorsStatus | QueueStatus | ComponentStatus]
     load: LoadResponse | None = Field(description="null while the catalog is unreachable")
 
 
@@ -156,14 +165,17 @@ def read_health(gateway: GatewayDep, admission: AdmissionDep, response: Response
     """Get the health of each component; 503 unless all are healthy.
 
     `degraded`: chunks or shards can't be searched, photos can't be described, uploads are refused
-    because the disk or the job queue is full, no steward is running, or orphans are not collected.
+    because the disk or the job queue is full, Redis takes no messages, no steward is running, or
+    orphans are not collected.
     """
-    components: dict[str, ExtractorsStatus | ComponentStatus] = {
+    components: dict[str, ExtractorsStatus | QueueStatus | ComponentStatus] = {
         **_check_components(gateway, admission),
     }
     has_catalog = components["catalog"].status == "healthy"
     if has_catalog:
-        components["extractors"] = _check_extractors(gateway)
+        depth = admission.queue_depth()
+        components["queue"] = _check_messages(gateway, depth)
+        components["extractors"] = _check_extractors(gateway, depth)
         components |= _check_stewards(gateway)
     if components["object_store"].status == "healthy":
         components["object_store"] = _check_collection(gateway)
@@ -251,20 +263,43 @@ def _check_search(gateway: GatewayContext) -> ComponentStatus:
         problems.append(
             f"{len(status.missing)} chunks can't be read: {named}"
             + (f" and {more} more" if more > 0 else "")
-            + " (repair them with placewise storage verify --repair)"
+            + (
+                " (the cache disk of a search worker is full: free space in its PLACEWISE_HOME; "
+                "the chunks are then loaded)"
+                if status.disk_full
+                else " (repair them with placewise storage verify --repair)"
+            )
         )
     if problems:
         return ComponentStatus(status="degraded", detail="; ".join(problems))
     return ComponentStatus(status="healthy", detail=f"{status.rows} rows in memory")
 
 
-def _check_extractors(gateway: GatewayContext) -> ExtractorsStatus:
+def _check_messages(gateway: GatewayContext, depth: QueueDepth) -> QueueStatus:
+    status, detail = "healthy", f"{depth.finished} photos and queries finished in the last minute"
+    if depth.oldest_seconds:
+        detail = f"the oldest job has waited for {depth.oldest_seconds:.0f} s, {detail}"
+    if problem := gateway.wakeups.problem:
+        status = "degraded"
+        detail = f"Redis takes no messages ({problem}), so photos are described later; {detail}"
+    return QueueStatus(
+        status=status,
+        detail=detail,
+        oldest_waiting_seconds=depth.oldest_seconds,
+        finished_in_last_minute=depth.finished,
+    )
+
+
+def _check_extractors(gateway: GatewayContext, depth: QueueDepth) -> ExtractorsStatus:
     with gateway.catalog.read() as session:
         extractors = [p for p in list_processes(session) if p.role == "extractor"]
-        used = list_extractors_in_use(session)
+        used = {*list_extractors_in_use(session), gateway.settings.local_features}
         overdue = is_job_overdue(session, PROCESS_TIMEOUT_SECONDS)
         waiting = list_maps_without_vocabulary(session)
         failed = count_failed_photos(session)
+    details: dict[str, str] = {}
+    for process in extractors:
+        details |= process.state.get("error_details", {})
     live = [
         ExtractorProcess(
             name=process.name,
@@ -279,11 +314,17 @@ def _check_extractors(gateway: GatewayContext) -> ExtractorsStatus:
     ]
     problems = sorted(
         {
-            f"{name} can't be loaded ({code}); the extractor's log has the details"
+            f"{name} can't be loaded ({code}): {details.get(name, '')}"
             for process in live
             for name, code in process.errors.items()
         }
     )
+    if live and depth.is_stalled:
+        problems.append(
+            f"no job has finished in the last minute, and one has waited for "
+            f"{depth.oldest_seconds:.0f} s (usual: {depth.usual_seconds:.0f} s). Read the "
+            "extractors' logs, and restart them"
+        )
     # Extractors that are scaled to zero while no job is queued unregister when they stop.
     if not live and (extractors or overdue):
         problems.append("no extractor is running: photos are stored, but not described")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from typing import Annotated
 from uuid import UUID
 
@@ -32,10 +32,10 @@ from services.gateway.schemas import JobResponse, JobsResponse
 from shared.catalog.database.errors import to_unavailable
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, UNFINISHED_STATES, get_job, list_jobs
 from shared.catalog.maps import get_map
-from shared.jobs import JobKind, JobState
+from shared.jobs import Job, JobKind, JobState
 from shared.jobs.model_changes import cancel_model_change
 from shared.jobs.transitions import cancel_batch, cancel_job, retry_batch, retry_job
-from shared.jobs.wakeups import queue_for_priority
+from shared.jobs.wakeups import read_job_messages, report_jobs
 
 router = APIRouter(tags=["jobs"])
 
@@ -44,8 +44,8 @@ HEARTBEAT_SECONDS = 15.0  # interval of comment lines, so that proxies do not cl
 
 
 class JobsParams(MapPageParams):
-    state: list[JobState] | None = None
-    kind: list[JobKind] | None = None
+    state: list[JobState] | None = Field(None, max_length=len(JobState))
+    kind: list[JobKind] | None = Field(None, max_length=len(JobKind))
 
 
 @router.get("/jobs", operation_id="list_jobs", dependencies=[READ])
@@ -57,10 +57,10 @@ def read_jobs(gateway: GatewayDep, query: Annotated[JobsParams, Query()]) -> Job
         jobs = list_jobs(
             session, map_id, query.state or [], query.kind or [], query.limit + 1, before
         )
+        names = _read_filenames(session, jobs)
     page, next_cursor = query.split(jobs)
-    return JobsResponse(
-        jobs=[JobResponse.of(job, query.map) for job in page], next_cursor=next_cursor
-    )
+    responses = [JobResponse.of(job, query.map, names.get(job.id)) for job in page]
+    return JobsResponse(jobs=responses, next_cursor=next_cursor)
 
 
 class JobStatusParams(MapParams):
@@ -76,7 +76,18 @@ async def read_job_status(
     if query.wait and job.state in UNFINISHED_STATES:
         seconds = min(query.wait, MAX_WAIT_SECONDS)
         job = await wait_for_job(gateway, job_id, seconds) or job
-    return JobResponse.of(job, query.map)
+    return await run_in_threadpool(_job_response, gateway, job, query.map)
+
+
+def _read_filenames(session: Session, jobs: Sequence[Job]) -> dict[UUID, str | None]:
+    """Return the name of each job's photo or uploaded file."""
+    ids = [job.id for job in jobs]
+    return {message.id: message.file for message in read_job_messages(session, ids)}
+
+
+def _job_response(gateway: GatewayContext, job: Job, map_name: str) -> JobResponse:
+    with gateway.catalog.read() as session:
+        return JobResponse.of(job, map_name, _read_filenames(session, [job]).get(job.id))
 
 
 async def _hold_event_stream(request: Request, admission: AdmissionDep) -> AsyncIterator[None]:
@@ -100,8 +111,9 @@ async def stream_job_events(
     If too many streams are open (429, `too_many_event_streams`), poll the job instead.
     """
     job = await run_in_threadpool(load_job_of_map, gateway, query.map, job_id)
+    response = await run_in_threadpool(_job_response, gateway, job, query.map)
     return StreamingResponse(
-        _events(gateway, job_id, JobResponse.of(job, query.map), query.map),
+        _events(gateway, job_id, response, query.map),
         media_type="text/event-stream",
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
@@ -123,11 +135,13 @@ def cancel_job_by_id(
             cancel_job(job)
         session.flush()
         session.refresh(job)
-        response = JobResponse.of(job, query.map)
+        response = JobResponse.of(job, query.map, _read_filenames(session, [job]).get(job.id))
         idempotent.store_response(session, 200, response)
         return response
 
-    return gateway.catalog.run(cancel)
+    response = gateway.catalog.run(cancel)
+    report_jobs(gateway.catalog, gateway.wakeups, [job_id])
+    return response
 
 
 @router.post("/jobs/{job_id}/retry", operation_id="retry_job", dependencies=[WRITE, ADMIT_JOB])
@@ -143,9 +157,11 @@ def retry_job_by_id(
             retry_job(session, job)
         session.flush()
         session.refresh(job)
-        response = JobResponse.of(job, query.map)
+        response = JobResponse.of(job, query.map, _read_filenames(session, [job]).get(job.id))
         idempotent.store_response(session, 200, response)
-    gateway.wakeups.send(queue_for_priority(job.priority))
+        messages = read_job_messages(session, [job.id])
+    report_jobs(gateway.catalog, gateway.wakeups, [job.id])
+    gateway.wakeups.send(*messages)
     return response
 
 
@@ -175,4 +191,4 @@ async def _events(
                 await asyncio.sleep(CATALOG_RETRY_SECONDS)
         if change is None:
             return
-        job, last_seen = JobResponse.of(change.job, map_name), change.state
+        job, last_seen = JobResponse.of(change.job, map_name, job.filename), change.state

@@ -14,7 +14,8 @@ from sqlalchemy.orm import Session
 from services.gateway.authentication import READ, WRITE, get_caller
 from services.gateway.dependencies import ALL_MAPS, NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep
 from services.gateway.idempotency import IdempotentDep
-from services.gateway.schemas import RequestModel, ResponseModel
+from services.gateway.json_bodies import JsonRoute
+from services.gateway.schemas import ResponseModel
 from shared.catalog.chunks import count_features, find_features_model
 from shared.catalog.generations import Generation, RowType, active_generation
 from shared.catalog.jobs import UNFINISHED_STATES, list_jobs
@@ -40,11 +41,12 @@ from shared.evaluation.places.fit import MIN_OWN_PHOTOS
 from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import PlaceModel
 from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
+from shared.http.request_model import RequestModel
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.model_changes import get_unfinished_model_change, start_reindex
 from shared.jobs.transitions import cancel_jobs
 
-router = APIRouter(tags=["maps"], dependencies=[NO_PARAMETERS])
+router = APIRouter(tags=["maps"], dependencies=[NO_PARAMETERS], route_class=JsonRoute)
 
 Measurement = Literal["measured", "running", "due", "not_measured", "too_few_photos"]
 MapNamePath = Annotated[

@@ -14,10 +14,10 @@ from services.gateway.admission import ADMIT_JOB, AdmissionDep, UploadKind
 from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import NO_NUL_PATTERN, GatewayContext, GatewayDep, MapQuery
 from services.gateway.idempotency import IdempotentDep, IdempotentFormDep, IdempotentRequest
+from services.gateway.json_bodies import JsonRoute
 from services.gateway.schemas import (
     GenerationResponse,
     JobAcceptedResponse,
-    RequestModel,
     VocabularyResponse,
 )
 from services.gateway.uploads.multipart import FormFile, multipart_schema, receive_form_file
@@ -35,12 +35,14 @@ from shared.extractor_config.configs import (
     MAX_PCA_DIMENSION,
     ExtractorConfig,
 )
+from shared.http.request_model import RequestModel
 from shared.jobs import Job, JobKind
 from shared.jobs.model_changes import start_model_change
+from shared.jobs.wakeups import JobMessage
 from shared.storage.keys import new_vocabulary_key
 from shared.storage.vocabulary_npz import encode_vocabulary_file
 
-router = APIRouter(tags=["model changes"])
+router = APIRouter(tags=["model changes"], route_class=JsonRoute)
 
 MAX_VOCABULARY_BYTES = 64_000_000
 
@@ -106,7 +108,7 @@ def start_vocabulary_fit(
             raise Conflict("no_photos", "The map has no photos to fit on. Upload photos first.")
         job = start_model_change(session, map_id, JobKind.FIT, params)
         accepted = idempotent.accept_job(session, job)
-    gateway.wakeups.send()
+    gateway.wakeups.send(JobMessage.of(job, query.map))
     return accepted
 
 
@@ -148,7 +150,7 @@ def _queue_import(
         map_id = get_map(session, map_name).id
         job = start_model_change(session, map_id, JobKind.IMPORT, params)
         accepted = idempotent.accept_job(session, job)
-    gateway.wakeups.send()
+    gateway.wakeups.send(JobMessage.of(job, map_name))
     return accepted
 
 
@@ -224,7 +226,7 @@ def start_generation(
         else:
             job = _queue_switch(session, map_id, config, body.vocabulary_id)
         accepted = idempotent.accept_job(session, job)
-    gateway.wakeups.send()
+    gateway.wakeups.send(JobMessage.of(job, query.map))
     return accepted
 
 

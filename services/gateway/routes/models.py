@@ -26,6 +26,7 @@ from services.gateway.dependencies import (
     MapQuery,
 )
 from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
+from services.gateway.json_bodies import JsonRoute
 from services.gateway.schemas import JobAcceptedResponse, ResponseModel
 from services.gateway.uploads.multipart import FormFile, multipart_schema, receive_form_file
 from shared.catalog.maps import get_map
@@ -44,6 +45,7 @@ from shared.extractor_config.names import (
 )
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
+from shared.jobs.wakeups import JobMessage
 from shared.storage.keys import new_checkpoint_key
 
 # The largest backbone (ViT-g) has 4.5 GB of weights. Only admins add models.
@@ -71,7 +73,7 @@ MODEL_FORM_FIELDS: dict[str, dict[str, Any]] = {
     "note": {"type": "string", "maxLength": MAX_NOTE_CHARACTERS, "description": "free text"},
 }
 
-router = APIRouter(tags=["models"])
+router = APIRouter(tags=["models"], route_class=JsonRoute)
 
 ModelNamePath = Annotated[
     str, Path(description="the model's name", min_length=1, max_length=100, pattern=NO_NUL_PATTERN)
@@ -104,12 +106,13 @@ class ModelResponse(ResponseModel):
 
     @classmethod
     def of(cls, session: Session, model: Model) -> ModelResponse:
-        assert model.config is not None
+        config = model.config or {}
         maps = list_maps_using_model(session, model)
         return cls.of_row(
             model,
-            extractor=model.config.get("extractor", model.name),
-            image_size=model.config["image_size"],
+            config=config,
+            extractor=config.get("extractor", model.name),
+            image_size=config.get("image_size"),
             maps=maps,
         )
 
@@ -178,7 +181,7 @@ def _queue_model(
             },
         )
         accepted = idempotent.accept_job(session, job)
-    gateway.wakeups.send()
+    gateway.wakeups.send(JobMessage.of(job, map_name))
     return accepted
 
 

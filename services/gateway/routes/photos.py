@@ -27,6 +27,7 @@ from services.gateway.dependencies import (
     PageParams,
     invalid_cursor_error,
 )
+from services.gateway.json_bodies import JsonRoute
 from services.gateway.photo_search import MAX_COUNTED_MATCHES, MetadataFilter, search_photos
 from services.gateway.schemas import (
     DeletedPhotoResponse,
@@ -34,7 +35,6 @@ from services.gateway.schemas import (
     MetadataSearchResponse,
     PhotoDetailResponse,
     PhotoResponse,
-    RequestModel,
 )
 from services.gateway.similarity.search_params import (
     FilterParams,
@@ -46,20 +46,26 @@ from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import get_map, increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole, get_photo, mark_photo_deleted
 from shared.errors import NotFound, invalid_field_error
+from shared.http.request_model import RequestModel
+from shared.imaging.capture_place import MAX_ALTITUDE_M
 from shared.imaging.file_formats import needs_preview
-from shared.imaging.photo_header import MAX_ALTITUDE_M
 from shared.ingest.photo_metadata import (
-    check_coordinate_pair,
+    MAX_METADATA_FIELDS,
+    MAX_PATH_CHARACTERS,
+    MAX_TAGS,
+    MAX_TEXT_CHARACTERS,
     check_metadata,
+    coordinate_pair,
     parse_relative_path,
     parse_tags,
     parse_time,
 )
 from shared.jobs import Job, JobKind, JobState, Priority
 from shared.jobs.transitions import cancel_jobs, requeue_job_as_new
+from shared.jobs.wakeups import JobMessage
 from shared.storage.keys import preview_key, thumbnail_key
 
-router = APIRouter(tags=["photos"])
+router = APIRouter(tags=["photos"], route_class=JsonRoute)
 
 STREAM_READ_BYTES = 256 * 1024
 IMAGE_RESPONSE: dict[int | str, dict[str, Any]] = {
@@ -75,6 +81,9 @@ def read_photo(gateway: GatewayDep, file_id: FileId, query: MapQuery) -> PhotoDe
         return _photo_detail_response(session, photo, query.map)
 
 
+Label = Annotated[str, Field(max_length=MAX_TEXT_CHARACTERS, pattern=NO_NUL_PATTERN)]
+
+
 class PhotoUpdate(RequestModel):
     """Fields to update: omitted fields are unchanged, null clears a field."""
 
@@ -84,13 +93,16 @@ class PhotoUpdate(RequestModel):
         float | None, Field(ge=-MAX_ALTITUDE_M, le=MAX_ALTITUDE_M, allow_inf_nan=False)
     ] = None
     heading: Annotated[float | None, Field(ge=0, le=360, allow_inf_nan=False)] = None
-    captured_at: str | None = None
-    place: Annotated[str | None, Field(max_length=500, pattern=NO_NUL_PATTERN)] = None
-    tags: list[Annotated[str, Field(pattern=NO_NUL_PATTERN)]] | None = None
-    metadata: dict[str, Any] | None = None
+    captured_at: Annotated[str | None, Field(max_length=100)] = None
+    place: Label | None = None
+    tags: Annotated[list[Label] | None, Field(max_length=MAX_TAGS)] = None
+    metadata: Annotated[dict[str, Any] | None, Field(max_length=MAX_METADATA_FIELDS)] = None
     role: PhotoRole | None = None
-    relative_path: Annotated[str | None, Field(max_length=1000, pattern=NO_NUL_PATTERN)] = Field(
-        None, description="path in its folder or archive, such as Day 2/IMG_2078.jpg"
+    relative_path: str | None = Field(
+        None,
+        max_length=MAX_PATH_CHARACTERS,
+        pattern=NO_NUL_PATTERN,
+        description="path in its folder or archive, such as Day 2/IMG_2078.jpg",
     )
 
     def to_columns(self) -> dict[str, Any]:
@@ -125,7 +137,7 @@ def patch_photo(
         photo = get_photo(session, map_.id, file_id)
         for name, value in columns.items():
             setattr(photo, name, value)
-        check_coordinate_pair(photo.latitude, photo.longitude)
+        photo.latitude, photo.longitude = coordinate_pair(photo.latitude, photo.longitude)
         photo.changed_version = increment_map_version(session, map_.id)
         session.flush()
         return _photo_detail_response(session, photo, query.map)
@@ -238,7 +250,7 @@ def read_preview(
         job = gateway.catalog.run(
             lambda session: _queue_preview(session, admission, photo, query.map)
         )
-        gateway.wakeups.send()
+        gateway.wakeups.send(JobMessage.of(job, query.map, photo.filename))
         return JobAcceptedResponse.of(job, query.map).to_http()
     return Response(data, media_type="image/jpeg", headers=headers)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from datetime import timedelta
 from typing import Annotated, Literal, Self
 
 from fastapi import APIRouter, Body
@@ -10,7 +11,8 @@ from pydantic import AwareDatetime, ConfigDict, Field, model_validator
 
 from services.gateway.authentication import READ
 from services.gateway.dependencies import NO_PARAMETERS, GatewayDep, MapQuery
-from services.gateway.schemas import RequestModel, ResponseModel
+from services.gateway.json_bodies import JsonRoute
+from services.gateway.schemas import ResponseModel
 from shared.catalog.chunks import count_searchable
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
@@ -22,13 +24,17 @@ from shared.geotagging.evidence import (
     ProbableCircle,
     SimilarPosition,
     TimeNeighbours,
+    add_time_zones,
     interpolate_position,
 )
 from shared.geotagging.fusion import propose_position
+from shared.http.request_model import FailFastList, RequestModel
+from shared.imaging.capture_place import is_null_island
 from shared.imaging.photo_header import read_photo_header
+from shared.ingest.photo_metadata import coordinate_pair
 from shared.tracks.motion import motion_model
 
-router = APIRouter(tags=["photos"])
+router = APIRouter(tags=["photos"], route_class=JsonRoute)
 
 MAX_NAME = 1000
 MAX_UNLOCATED = 100
@@ -51,9 +57,17 @@ class PhotoHeaderResponse(ResponseModel):
         description="UTC; if `time_zone_is_known` is false, the camera's clock as if it were UTC"
     )
     time_zone_is_known: bool
-    camera: str | None = Field(description="make, model and serial number")
+    camera: str | None = Field(description="make, model, owner and serial number")
+    camera_is_unique: bool = Field(description="`camera` contains a serial number or an owner")
+    clock_offset: timedelta | None = Field(
+        description="of the camera's clock from UTC, by its tag or the GPS time"
+    )
     latitude: float | None
     longitude: float | None
+    gps_error: str | None = Field(
+        description="why the photo may have coordinates although none are known: a tag that is not "
+        "understood, or metadata behind the bytes that were sent; propose none for it"
+    )
     focal_length: float | None = Field(description="as a multiple of the photo's longer side")
 
 
@@ -104,6 +118,8 @@ class DatedPhotoBody(_Finite):
     captured_at: AwareDatetime | None = None
     time_zone_is_known: bool = False
     camera: Name | None = None
+    camera_is_unique: bool = False
+    clock_offset: timedelta | None = None
     latitude: Latitude | None = None
     longitude: Longitude | None = None
     search: SearchBody | None = None
@@ -113,6 +129,10 @@ class DatedPhotoBody(_Finite):
         if (self.latitude is None) != (self.longitude is None):
             raise ValueError("send both `latitude` and `longitude`, or neither")
         return self
+
+    def coordinates(self) -> tuple[float | None, float | None]:
+        """Return latitude and longitude; 0, 0 are none."""
+        return coordinate_pair(self.latitude, self.longitude)
 
 
 class TrackPointBody(_Finite):
@@ -124,12 +144,12 @@ class TrackPointBody(_Finite):
 class PositionsBody(_Finite):
     """The photos of a folder."""
 
-    photos: list[DatedPhotoBody] = Field(
+    photos: FailFastList[DatedPhotoBody] = Field(
         max_length=10_000,
         description=f"at most {MAX_UNLOCATED} of them without coordinates; the others show where "
         "their camera was",
     )
-    track: list[TrackPointBody] = Field(
+    track: FailFastList[TrackPointBody] = Field(
         default=[], max_length=10_000, description="points of a GPX track"
     )
     radius_m: float = Field(100.0, ge=10, le=2000, description="radius of the proposals")
@@ -173,7 +193,10 @@ def read_header(
         bytes, Body(media_type="application/octet-stream", description="first bytes of the photo")
     ],
 ) -> PhotoHeaderResponse:
-    """Read time, camera and coordinates from the first bytes of a photo; 256 KiB are enough."""
+    """Read time, camera and coordinates from the first bytes of a photo.
+
+    256 KiB are enough for most; send the whole file if they can't be read, or with `gps_error`.
+    """
     header = read_photo_header(io.BytesIO(begin), gateway.settings.max_image_pixels)
     return PhotoHeaderResponse.model_validate(header)
 
@@ -196,14 +219,20 @@ def propose_positions(
             each.captured_at,
             each.time_zone_is_known,
             each.camera,
-            each.latitude,
-            each.longitude,
+            *each.coordinates(),
+            each.clock_offset,
+            each.camera_is_unique,
         )
         for each in body.photos
     ]
+    photos = add_time_zones(photos)
     neighbours = TimeNeighbours(photos, body.together)
     track = sorted(
-        (KnownPosition(each.time, each.latitude, each.longitude) for each in body.track),
+        (
+            KnownPosition(each.time, each.latitude, each.longitude)
+            for each in body.track
+            if not is_null_island(each.latitude, each.longitude)
+        ),
         key=lambda point: point.time,
     )
     speed = motion_model(body.motion).max_speed_mps
@@ -229,7 +258,7 @@ def propose_positions(
                 probability=proposal.probability if proposal else 0.0,
                 radius_68_m=proposal.radius_68_m if proposal else None,
                 heading=proposal.heading if proposal else None,
-                reason=proposal.reason if proposal else "nothing is known about its place",
+                reason=proposal.reason if proposal else neighbours.why_unknown(photo),
             )
         )
     return ProposalsResponse(proposals=proposals)

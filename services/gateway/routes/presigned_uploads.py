@@ -38,6 +38,7 @@ from services.gateway.dependencies import (
     UploadId,
 )
 from services.gateway.idempotency import IdempotentDep, IdempotentReplay, delete_if_refused
+from services.gateway.json_bodies import JsonRoute
 from services.gateway.routes.photos import PhotoUpdate
 from services.gateway.routes.uploads import (
     UPLOAD_RESPONSES,
@@ -52,7 +53,7 @@ from shared.catalog.maps import get_map
 from shared.catalog.photos import PresignedUpload, get_presigned_upload
 from shared.errors import Conflict, NotFound, Unavailable, Unprocessable
 from shared.ids import new_id
-from shared.ingest.photo_metadata import PhotoFields, check_coordinate_pair
+from shared.ingest.photo_metadata import PhotoFields, coordinate_pair
 from shared.ingest.store_photo import StoreResult, insert_photo
 from shared.ingest.validation import (
     StoredUpload,
@@ -64,7 +65,7 @@ from shared.ingest.validation import (
 from shared.storage import ObjectInfo, PresigningStore
 from shared.storage.keys import incoming_key, new_original_key
 
-router = APIRouter(tags=["photos"])
+router = APIRouter(tags=["photos"], route_class=JsonRoute)
 
 PRESIGN_SECONDS = 900  # to send and complete an upload: 100 MB at 1 Mbit/s
 FILE_FIELDS = ("filename", "file_size", "sha256")
@@ -171,11 +172,9 @@ async def complete_presigned_upload(
     The responses are those of `POST /upload`. A repeated request gets the same response again.
     """
     with admission.admit_upload(UploadKind.UPLOAD, request):
-        stored, key = await run_in_threadpool(
-            _complete_upload, request, gateway, query.map, upload_id
-        )
+        stored = await run_in_threadpool(_complete_upload, request, gateway, query.map, upload_id)
     job = await wait_for_description(request, response, gateway, stored)
-    outcome = UploadOutcome.of(stored, job, key, query.map)
+    outcome = UploadOutcome.of(stored, job, query.map)
     if outcome.status == 201:
         await run_in_threadpool(_replace_response, gateway, upload_id, outcome)
     return outcome.send(response)
@@ -183,8 +182,8 @@ async def complete_presigned_upload(
 
 def _complete_upload(
     request: Request, gateway: GatewayContext, map_name: str, upload_id: UUID
-) -> tuple[StoreResult, str]:
-    """Copy the object, validate the copy and store the photo; also returns the copy's key.
+) -> StoreResult:
+    """Copy the object, validate the copy and store the photo.
 
     Raises:
         IdempotentReplay: The upload was completed before.
@@ -208,13 +207,13 @@ def _complete_upload(
             stored = insert_photo(session, map_name, photo)
             locked = get_presigned_upload(session, upload.map_id, upload_id, lock=True)
             _replay_if_completed(locked)
-            outcome = UploadOutcome.of(stored, stored.job, key, map_name)
+            outcome = UploadOutcome.of(stored, stored.job, map_name)
             locked.status, locked.response_body = outcome.status, outcome.body.model_dump_json()
-    finish_upload(gateway, stored, key)
+    finish_upload(gateway, stored, map_name)
     # The photo is acknowledged already; garbage collection deletes the object if this fails.
     with contextlib.suppress(Unavailable):
         store.delete(source_key)
-    return stored, key
+    return stored
 
 
 def _replace_response(gateway: GatewayContext, upload_id: UUID, outcome: UploadOutcome) -> None:
@@ -281,9 +280,10 @@ def _parse_photo_fields(values: dict[str, Any]) -> PhotoFields:
     columns = PhotoUpdate.model_validate(values).to_columns()
     if "attributes" in columns:
         columns["metadata"] = columns.pop("attributes")
-    fields = PhotoFields(**columns)
-    check_coordinate_pair(fields.latitude, fields.longitude)
-    return fields
+    columns["latitude"], columns["longitude"] = coordinate_pair(
+        columns.get("latitude"), columns.get("longitude")
+    )
+    return PhotoFields(**columns)
 
 
 def _require_presigning_store(gateway: GatewayContext) -> PresigningStore:

@@ -19,7 +19,8 @@ from services.gateway.admission import ADMIT_JOB
 from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import GatewayContext, GatewayDep, MapQuery, ReconstructionId
 from services.gateway.idempotency import IdempotentDep, IdempotentRequest
-from services.gateway.schemas import JobAcceptedResponse, RequestModel, ResponseModel
+from services.gateway.json_bodies import JsonRoute
+from services.gateway.schemas import JobAcceptedResponse, ResponseModel
 from shared.catalog.database.base import get_in_map
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import get_map, lock_map
@@ -33,11 +34,13 @@ from shared.catalog.reconstructions import (
 from shared.errors import Conflict, NotFound
 from shared.geodesy import distance_m
 from shared.geometry.colmap_model import ColmapModel, rename_images
+from shared.http.request_model import RequestModel
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
+from shared.jobs.wakeups import JobMessage
 from shared.storage.keys import new_checkpoint_key
 
-router = APIRouter(tags=["reconstructions"])
+router = APIRouter(tags=["reconstructions"], route_class=JsonRoute)
 
 IMPORT_PATH = "/reconstructions/import"
 MAX_MODEL_BYTES = 16_000_000
@@ -201,7 +204,7 @@ def _queue(
             params=params,
         )
         accepted = idempotent.accept_job(session, job)
-    gateway.wakeups.send()
+    gateway.wakeups.send(JobMessage.of(job, map_name))
     return accepted
 
 

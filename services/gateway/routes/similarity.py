@@ -38,7 +38,7 @@ from shared.catalog.maps import get_map
 from shared.errors import Conflict, Gone, NotFound, Unprocessable, invalid_field_error
 from shared.imaging.photo_header import read_photo_header
 from shared.jobs import Job, JobKind, JobState
-from shared.jobs.wakeups import WakeupQueue
+from shared.jobs.wakeups import JobMessage
 from shared.storage.keys import query_preview_key
 
 router = APIRouter(tags=["similarity"])
@@ -184,11 +184,9 @@ def _queue_query(
         with gateway.catalog.write() as session:
             map_ = get_map(session, map_name)
             check_matching_enabled(map_, search_params)
-            job = describe_query_job(
-                job_id, map_.id, upload.filename, search_params, header.focal_length
-            )
+            job = describe_query_job(job_id, map_.id, upload.filename, search_params, header)
             idempotent.store_job_response(session, job)
-    gateway.wakeups.send(WakeupQueue.QUERY)
+    gateway.wakeups.send(JobMessage.of(job, map_name))
     return job
 
 

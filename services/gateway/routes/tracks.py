@@ -37,6 +37,7 @@ from services.gateway.idempotency import (
     IdempotentFormDep,
     IdempotentRequest,
 )
+from services.gateway.json_bodies import JsonRoute
 from services.gateway.schemas import ResponseModel, accepted_headers, job_url, url_in_map
 from services.gateway.similarity.search_params import SearchParams
 from services.gateway.tracks.apply_frames import apply_pending_frames, smooth_states
@@ -68,9 +69,9 @@ from shared.catalog.tracks import (
 from shared.errors import Conflict
 from shared.ids import new_id
 from shared.imaging.photo_header import read_photo_header
-from shared.jobs.wakeups import WakeupQueue
+from shared.jobs.wakeups import JobMessage
 
-router = APIRouter(tags=["tracks"])
+router = APIRouter(tags=["tracks"], route_class=JsonRoute)
 
 APPLY_SECONDS = 5.0  # of one read; frames that remain pending are applied by the next one
 
@@ -344,17 +345,15 @@ def _accept_frame(
             if stored is frame:
                 # A pose without coordinates says nothing to the filter.
                 posed = SearchParams(matches=0, pose=gives_coordinates(session, track.map_id))
-                session.add(
-                    describe_query_job(
-                        job_id, track.map_id, received.filename, posed, header.focal_length
-                    )
-                )
+                job = describe_query_job(job_id, track.map_id, received.filename, posed, header)
+                session.add(job)
             response = _frame_response(stored, map_name)
             headers = accepted_headers(response.frame_url)
             idempotent.store_response(session, 202, response, headers)
-    if stored is not frame:
+    if stored is frame:
+        gateway.wakeups.send(JobMessage.of(job, map_name))
+    else:
         gateway.store.delete(received.key)
-    gateway.wakeups.send(WakeupQueue.QUERY)
     return stored
 
 

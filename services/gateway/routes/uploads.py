@@ -25,19 +25,25 @@ from services.gateway.dependencies import (
 )
 from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
 from services.gateway.schemas import UploadResponse, accepted_headers, url_in_map
-from services.gateway.uploads.multipart import FormFile, multipart_schema, receive_form_file
+from services.gateway.uploads.multipart import (
+    MAX_FIELDS_BYTES,
+    FormFile,
+    multipart_schema,
+    receive_form_file,
+)
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.photos import PhotoRole
+from shared.imaging.capture_place import MAX_ALTITUDE_M
 from shared.imaging.file_formats import ACCEPTED_PHOTOS, photo_suffix
-from shared.imaging.photo_header import MAX_ALTITUDE_M
 from shared.ingest.store_photo import StoreResult, insert_photo
 from shared.ingest.validation import check_photo_signature, validate_photo
 from shared.jobs import Job, JobState
+from shared.jobs.wakeups import JobMessage
 from shared.storage.keys import new_original_key
 
 router = APIRouter(tags=["photos"])
 
-_TEXT_SCHEMA = {"type": "string"}
+_TEXT_SCHEMA = {"type": "string", "maxLength": MAX_FIELDS_BYTES}
 UPLOAD_FORM = multipart_schema(
     ACCEPTED_PHOTOS,
     latitude={"type": "number", "minimum": -90, "maximum": 90},
@@ -48,7 +54,12 @@ UPLOAD_FORM = multipart_schema(
         "maximum": MAX_ALTITUDE_M,
         "description": "metres",
     },
-    heading={"type": "number", "minimum": 0, "maximum": 360},
+    heading={
+        "type": "number",
+        "minimum": 0,
+        "maximum": 360,
+        "description": "degrees clockwise from true north",
+    },
     captured_at={"type": "string", "format": "date-time"},
     place={**_TEXT_SCHEMA, "description": "a label, for places without useful coordinates"},
     tags={**_TEXT_SCHEMA, "description": "separated by commas"},
@@ -91,10 +102,13 @@ async def upload_photo(
 ) -> UploadResponse:
     """Store a photo and queue the job that describes it.
 
-    Fields that the form leaves out are read from EXIF. The response is 202 with the job to poll;
-    with `Prefer: wait=N`, 201 once the photo is searchable. If the map already has the same bytes,
-    the existing photo is returned: with 200 if it is searchable, otherwise as if it had been sent
-    for the first time (202 or 201). A failed or cancelled job is queued again.
+    Fields that the form leaves out are read from EXIF, or else from XMP in the file. The response
+    is 202 with the job to poll; with `Prefer: wait=N`, 201 once the photo is searchable. If the map
+    already has the same bytes, the existing photo is returned: with 200 if it is searchable,
+    otherwise as if it had been sent for the first time (202 or 201). A failed or cancelled job is
+    queued again. If the map has the same picture under the same path, in a file with other
+    metadata, the photo's file is replaced, and its coordinates, altitude, heading and time are
+    those of the new file, as far as it has some (`updated`).
     """
     with admission.admit_upload(UploadKind.UPLOAD, request):
         async with receive_form_file(
@@ -108,7 +122,7 @@ async def upload_photo(
                 _store_upload, request, gateway, query.map, file, idempotent
             )
     job = await wait_for_description(request, response, gateway, stored)
-    outcome = UploadOutcome.of(stored, job, file.upload.key, query.map)
+    outcome = UploadOutcome.of(stored, job, query.map)
     if outcome.status == 201:
         await run_in_threadpool(
             idempotent.replace_response, outcome.status, outcome.body, outcome.headers
@@ -125,11 +139,8 @@ class UploadOutcome:
     body: UploadResponse
 
     @classmethod
-    def of(cls, stored: StoreResult, job: Job | None, key: str, map_name: str) -> UploadOutcome:
-        """Build the response from the photo's job in its current state, if any.
-
-        `key` is the object key of the received bytes.
-        """
+    def of(cls, stored: StoreResult, job: Job | None, map_name: str) -> UploadOutcome:
+        """Build the response from the photo's job in its current state, if any."""
         status_url = url_in_map(
             f"/jobs/{job.id}" if job else f"/uploads/{stored.photo.id}", map_name
         )
@@ -141,7 +152,8 @@ class UploadOutcome:
             upload_time=stored.photo.uploaded_at,
             status=JobState(job.state) if job else JobState.SUCCEEDED,
             status_url=status_url,
-            already_there=stored.photo.object_key != key,
+            already_there=stored.already_there,
+            updated=list(stored.updated),
             message=_outcome_message(stored, job),
         )
         if stored.job is None or stored.job.state == JobState.SUCCEEDED:
@@ -183,22 +195,25 @@ def _store_upload(
         )
         with reserve_photo_quota(request, gateway.settings), gateway.catalog.write() as session:
             stored = insert_photo(session, map_name, photo)
-            outcome = UploadOutcome.of(stored, stored.job, upload.key, map_name)
+            outcome = UploadOutcome.of(stored, stored.job, map_name)
             idempotent.store_response(session, outcome.status, outcome.body, outcome.headers)
-    finish_upload(gateway, stored, upload.key)
+    finish_upload(gateway, stored, map_name)
     return stored
 
 
-def finish_upload(gateway: GatewayContext, stored: StoreResult, key: str) -> None:
-    """After the commit: wake the extractors, and delete received bytes that the map has."""
-    if stored.queued:
-        gateway.wakeups.send()
-    if stored.photo.object_key != key:
-        gateway.store.delete(key)
+def finish_upload(gateway: GatewayContext, stored: StoreResult, map_name: str) -> None:
+    """After the commit: send the job's message, and delete the object that is not used."""
+    if stored.queued and stored.job is not None:
+        gateway.wakeups.send(JobMessage.of(stored.job, map_name, stored.photo.filename))
+    if stored.unused_key is not None:
+        gateway.store.delete(stored.unused_key)
 
 
 def _outcome_message(stored: StoreResult, job: Job | None) -> str:
     beginning = "The photo is stored" if stored.queued else "The map already has this photo"
+    if stored.updated:
+        names = ", ".join(stored.updated)
+        beginning = f"The map already has this photo; updated by its new metadata: {names}"
     if job is None or job.state == JobState.SUCCEEDED:
         return f"{beginning} and searchable." if stored.queued else f"{beginning}."
     reason = (job.error or {}).get("detail", "")

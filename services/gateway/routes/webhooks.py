@@ -11,7 +11,8 @@ from pydantic import Field, model_validator
 
 from services.gateway.authentication import ADMIN
 from services.gateway.dependencies import NO_PARAMETERS, GatewayDep, PageParams, WebhookId
-from services.gateway.schemas import RequestModel, ResponseModel
+from services.gateway.json_bodies import JsonRoute
+from services.gateway.schemas import ResponseModel
 from shared.catalog.webhooks import (
     Delivery,
     DeliveryState,
@@ -23,9 +24,10 @@ from shared.catalog.webhooks import (
     list_webhooks,
 )
 from shared.errors import PlacewiseError, invalid_field_error
+from shared.http.request_model import RequestModel
 from shared.security.webhook_targets import parse_webhook_url, resolve_webhook_target
 
-router = APIRouter(tags=["administration"])
+router = APIRouter(tags=["administration"], route_class=JsonRoute)
 
 
 class CreateWebhookRequest(RequestModel):

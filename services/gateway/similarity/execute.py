@@ -2,8 +2,6 @@
 
 Hits are joined with the catalog by photo id. Photos that have just been deleted are dropped, and
 the search is repeated with a larger k until k live photos are found or there are no more.
-
-The module also selects the word weights that a search ranks by (`select_ranking_weights`).
 """
 
 from __future__ import annotations
@@ -20,12 +18,13 @@ from sqlalchemy.orm import Session
 
 from services.gateway.dependencies import GatewayContext
 from services.gateway.schemas import (
+    CameraPoseResponse,
     EstimateResponse,
     SimilarityResponse,
     SimilarPhotoResponse,
     job_url,
 )
-from services.gateway.similarity.estimate import estimate_place, locate_hits
+from services.gateway.similarity.estimate import estimate_place, locate_hits, place_at_pose
 from services.gateway.similarity.matches import (
     MATCHING_IS_OFF,
     NO_MATCHES,
@@ -56,43 +55,10 @@ from shared.search_api.protocol import (
     SearchResponse,
 )
 from shared.storage.chunks import features_key
-from shared.word_weights.record import WordWeights, parse_word_weights
 
 log = logging.getLogger(__name__)
 
 WITH_PLACE = PhotoFilter(has_place=True)
-
-
-@dataclass(frozen=True, slots=True)
-class _RankingWeights:
-    """Word weights of a search, and the place model that belongs to them."""
-
-    generation: Generation
-    record: WordWeights | None
-    values: tuple[float, ...]
-    """One weight per word; () to rank by the plain cosine similarity."""
-
-    def state(self, hits: Sequence[SearchHit]) -> str:
-        """Return the response field `word_weights`: `applied`, `none` or `off`."""
-        if self.values:
-            return "applied" if self._ranked_by_weights(hits) else "none"
-        return "off" if self.record and self.record.applied else "none"
-
-    def calibration(self, hits: Sequence[SearchHit]) -> PlaceModel | None:
-        """Return the place model for this kind of ranking; None if there is none."""
-        if self.values and self.record and self._ranked_by_weights(hits):
-            return self.record.calibration
-        stored = self.generation.calibration
-        return PlaceModel.model_validate(stored) if stored else None
-
-    def _ranked_by_weights(self, hits: Sequence[SearchHit]) -> bool:
-        return not hits or hits[0].weighted_score is not None
-
-
-def select_ranking_weights(generation: Generation, enabled: bool) -> _RankingWeights:
-    """Select the word weights of the generation, unless the request disables them."""
-    record = parse_word_weights(generation.word_weights)
-    return _RankingWeights(generation, record, record.applied if record and enabled else ())
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +74,10 @@ class SimilarityQuery:
     filename: str
     focal_length: float | None = None
     """From the photo's EXIF, as a multiple of its longer side; None if it is not known"""
+    camera_key: str | None = None
+    """Of a query photo: `PhotoHeader.camera_key`"""
+    quarter_turns: int = 0
+    """Clockwise, by which the query photo was turned upright"""
     background: tuple[RowReference, ...] = ()
     """Descriptors whose mean is subtracted from the query"""
 
@@ -167,6 +137,8 @@ def query_from_job(gateway: GatewayContext, job: Job) -> SimilarityQuery:
             photo_id=None,
             filename=job.params["filename"],
             focal_length=job.params.get("focal_length"),
+            camera_key=job.params.get("camera_key"),
+            quarter_turns=job.params.get("quarter_turns") or 0,
         )
 
 
@@ -206,21 +178,22 @@ def run_similarity_search(
     """Rank the photos, match the best ones, estimate place and pose, make response and history row.
 
     One search answers most queries. Further ones are made for photos without a place among the
-    first, for a filter (the estimate is that of the whole map), for the neighbours of a best photo
-    that are not cached, and for `min_score` with word weights.
+    first, for a filter (the estimate is that of the whole map), and for the neighbours of a best
+    photo that are not cached.
     """
     started = time.perf_counter()
     check_matching_enabled(query.map, search_params)
-    weights = select_ranking_weights(query.generation, search_params.word_weights)
-    search = _MapSearch(gateway, query, search_params.mode, weights.values)
+    search = _MapSearch(gateway, query, search_params.mode)
     rankings = _rank_photos(search, search_params)
     matches = _match_best_photos(search, rankings, search_params)
-    estimate, probabilities = _estimate(search, rankings, matches, weights, search_params)
+    estimate, probabilities = _estimate(search, rankings, matches, search_params)
     # Along coordinates, queries of another season look as if they were not in the map.
     is_labelled = bool(estimate.levels) and estimate.levels[0].radius_m is None
     is_missing = is_labelled and estimate.in_map is False
     pose = find_pose(gateway, query, rankings.found.hits, search_params, is_missing=is_missing)
     similar = rankings.similar
+    if isinstance(pose, CameraPoseResponse):
+        estimate = place_at_pose(estimate, pose)
     hits = matches.rerank(similar.hits, search_params.rerank or 0)[: search_params.top_k]
     response = SimilarityResponse.of_row(
         similar.response,
@@ -234,7 +207,6 @@ def run_similarity_search(
         pose=None if isinstance(pose, str) else pose,
         no_pose=pose if isinstance(pose, str) else None,
         vocabulary=query.vocabulary,
-        word_weights=weights.state(rankings.found.hits),
         generation_id=query.generation.id,
         rows=RowType(query.generation.row_type),
         degraded=bool(similar.response.missing),
@@ -243,7 +215,6 @@ def run_similarity_search(
             similar.photos[hit.photo_id],
             query.map.name,
             similarity_score=hit.score,
-            weighted_score=hit.weighted_score,
             match_probability=probabilities.get(hit.photo_id),
             inliers=matches.inliers(hit.photo_id),
             pairs=matches.pairs(hit.photo_id) if search_params.explain else None,
@@ -281,14 +252,13 @@ class _Rankings:
 
 @dataclass(frozen=True, slots=True)
 class _MapSearch:
-    """Searches with one query, all ranked in the same way."""
+    """Searches with one query."""
 
     gateway: GatewayContext
     query: SimilarityQuery
     mode: Mode
-    weights: tuple[float, ...]
 
-    def find(self, photos: PhotoFilter, depth: int, min_score: float | None = None) -> _Found:
+    def find(self, photos: PhotoFilter, depth: int) -> _Found:
         """Return the first `depth` live photos; fewer if there are no more."""
         k, query = depth, self.query
         while True:
@@ -300,9 +270,7 @@ class _MapSearch:
                     min_version=query.map.version,
                     k=k,
                     photos=photos,
-                    min_score=min_score,
                     exclude=(query.photo_id,) if query.photo_id else (),
-                    word_weights=self.weights,
                     background=query.background,
                     mode=self.mode,
                 )
@@ -323,7 +291,7 @@ class _MapSearch:
         cached.
         """
         gateway, query = self.gateway, self.query
-        key = (query.generation.id, query.map.version, photo_id, self.weights, self.mode)
+        key = (query.generation.id, query.map.version, photo_id, self.mode)
         with gateway.neighbours_lock:
             cached = gateway.neighbours.get(key)
         if cached is not None:
@@ -354,20 +322,9 @@ def _rank_photos(search: _MapSearch, search_params: SearchParams) -> _Rankings:
         with_place = photo_filter.model_copy(update={"has_place": True})
         located = search.find(with_place, len(found.hits))
     whole_map = located if photo_filter.is_empty else search.find(WITH_PLACE, EVIDENCE_DEPTH)
-    similar = _first_similar(search, found, search_params, depth)
-    return _Rankings(found, located, whole_map, similar)
-
-
-def _first_similar(
-    search: _MapSearch, found: _Found, search_params: SearchParams, depth: int
-) -> _Found:
-    """Return the first `depth` photos whose plain cosine similarity reaches `min_score`."""
-    first, min_score = replace(found, hits=found.hits[:depth]), search_params.min_score
-    if min_score is None:
-        return first
-    if search.weights:  # matching photos may be anywhere in the ranking by weighted scores
-        return search.find(search_params.photos, depth, min_score)
-    return replace(first, hits=[hit for hit in first.hits if hit.score >= min_score])
+    least = -1.0 if search_params.min_score is None else search_params.min_score
+    similar = [hit for hit in found.hits[:depth] if hit.score >= least]
+    return _Rankings(found, located, whole_map, replace(found, hits=similar))
 
 
 def _match_best_photos(
@@ -393,13 +350,12 @@ def _estimate(
     search: _MapSearch,
     rankings: _Rankings,
     matches: QueryMatches,
-    weights: _RankingWeights,
     search_params: SearchParams,
 ) -> tuple[EstimateResponse, dict[UUID, float]]:
     """Return the place estimate, and the probabilities that photos show the query's place."""
     query, settings = search.query, search.gateway.settings
     found, whole_map = rankings.found, rankings.whole_map
-    model, scheme = _place_model(search, weights, found.hits)
+    model, scheme = _place_model(search)
     certainty = search_params.certainty or settings.certainty
     neighbours = search.rank_neighbours(whole_map.hits[0].photo_id) if whole_map.hits else ()
     places = model.estimate(
@@ -409,28 +365,28 @@ def _estimate(
         certainty,
         settings.estimate_radius_m,
         matches.add_to(rankings.located.ranking),
+        search_params.elsewhere,
     )
-    estimate = estimate_place(
-        places,
-        certainty,
-        settings.estimate_radius_m,
-        _no_place_reason(found.hits, search_params.photos),
-    )
+    similar = locate_hits(rankings.similar.hits[: search_params.top_k], rankings.similar.photos)
+    if not any(ranked.location.is_known for ranked in similar):
+        places = None  # the photos that it would be named after do not look like the query
+    reason = _no_place_reason(found.hits, search_params.photos)
+    estimate = estimate_place(places, certainty, search_params.elsewhere, reason)
     if places is None or not model.is_fitted:
         return estimate, {}
     best = (hit.photo_id for hit in rankings.located.hits)
     return estimate, dict(zip(best, places.match_probabilities, strict=True))
 
 
-def _place_model(
-    search: _MapSearch, weights: _RankingWeights, hits: Sequence[SearchHit]
-) -> tuple[PlaceModel, LevelScheme]:
-    """Return the model of the map's estimates for the ranking of these hits, and its levels."""
+def _place_model(search: _MapSearch) -> tuple[PlaceModel, LevelScheme]:
+    """Return the model of the map's estimates, and its levels."""
     scheme = LevelScheme(
         labels_are_paths=search.query.map.place_labels_are_paths,
         radii_m=search.gateway.settings.level_radii_m,
     )
-    return (weights.calibration(hits) or PlaceModel()).for_scheme(scheme), scheme
+    stored = search.query.generation.calibration
+    model = PlaceModel.model_validate(stored) if stored else PlaceModel()
+    return model.for_scheme(scheme), scheme
 
 
 def _make_history(
@@ -459,7 +415,7 @@ def _make_history(
 def _no_place_reason(hits: Sequence[SearchHit], photo_filter: PhotoFilter) -> str:
     """Return why there is no estimate, if no photo with a place was found."""
     if hits:
-        return "None of the photos that were found has coordinates or a place label."
+        return "The photos that look like it have no coordinates and no place label."
     if photo_filter.is_empty:
         return "The map has no searchable photos yet."
     return "No photo of the map matches the filter."
@@ -467,18 +423,16 @@ def _no_place_reason(hits: Sequence[SearchHit], photo_filter: PhotoFilter) -> st
 
 def rank_live_photos(gateway: GatewayContext, query: SimilarityQuery, k: int) -> list[SearchHit]:
     """Return the first `k` live photos of the map, most similar first, without an estimate."""
-    weights = select_ranking_weights(query.generation, True).values
-    return _MapSearch(gateway, query, Mode.AUTO, weights).find(NO_FILTER, k).hits
+    return _MapSearch(gateway, query, Mode.AUTO).find(NO_FILTER, k).hits
 
 
 def missing_log_odds(gateway: GatewayContext, query: SimilarityQuery) -> float | None:
     """Return `PlaceModel.missing_log_odds` of a query; None before the map is evaluated."""
     if query.generation.calibration is None:
         return None
-    weights = select_ranking_weights(query.generation, True)
-    search = _MapSearch(gateway, query, Mode.AUTO, weights.values)
+    search = _MapSearch(gateway, query, Mode.AUTO)
     found = search.find(WITH_PLACE, EVIDENCE_DEPTH)
-    model, scheme = _place_model(search, weights, found.hits)
+    model, scheme = _place_model(search)
     if not found.hits:
         return None
     if not scheme.labels_are_paths and found.ranking[0].location.latitude is not None:

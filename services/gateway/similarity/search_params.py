@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from services.gateway.dependencies import MapParams
 from shared.errors import invalid_field_error
+from shared.evaluation.places.probability import ELSEWHERE_SHARE
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS, parse_tags, parse_time
 from shared.search_api.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
 from shared.search_api.protocol import MAX_MATCHED_PHOTOS, Mode
@@ -144,9 +145,6 @@ class RankingParams(BaseModel):
     min_score: float | None = Field(
         None, ge=-1, le=1, description="Minimum cosine similarity of the returned photos."
     )
-    word_weights: bool = Field(
-        True, description="Rank by the word weights of the map, if it has any."
-    )
     matches: int | None = Field(
         None,
         ge=0,
@@ -179,6 +177,12 @@ class RankingParams(BaseModel):
         "quaternion",
         description="Form of the answer to `Accept: application/geopose+json`: Basic-Quaternion or "
         "Basic-YPR of OGC GeoPose 1.0.",
+    )
+    elsewhere: float = Field(
+        ELSEWHERE_SHARE,
+        gt=0,
+        lt=1,
+        description="Share of your queries that are from elsewhere than the map.",
     )
     certainty: float | None = Field(
         None,

@@ -47,7 +47,6 @@ from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
 from shared.geodesy import distances_m
 from shared.jobs import Job, JobState
 from shared.jobs.transitions import requeue_job_as_new
-from shared.jobs.wakeups import WakeupQueue
 from shared.search_api.background import background_frames
 from shared.search_api.protocol import MAX_MATCHED_PHOTOS, RowReference, SearchHit
 from shared.tracks.belief import Belief
@@ -145,7 +144,7 @@ def _search_evidence(gateway: GatewayContext, pending: _PendingFrame) -> FrameEv
     return frame_evidence(
         pending.frame.captured_at,
         [str(hit.photo_id) for hit in hits],
-        [hit.ranked_by for hit in hits],
+        [hit.score for hit in hits],
         photo_count,
         missing=missing_log_odds(gateway, query),
         fix=min(filter(None, fixes), key=lambda fix: fix.accuracy_m, default=None),
@@ -244,7 +243,7 @@ def _describe_again(gateway: GatewayContext, job_id: UUID) -> None:
         job = session.get(Job, job_id, with_for_update=True)
         if job is not None and job.state == JobState.SUCCEEDED:
             requeue_job_as_new(job)
-    gateway.wakeups.send(WakeupQueue.QUERY)
+    gateway.wakeups.send()
 
 
 def smooth_states(

@@ -9,8 +9,9 @@ from uuid import UUID
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from services.gateway.dependencies import NO_NUL_PATTERN
-from services.gateway.schemas import EstimateLevelResponse, RequestModel, ResponseModel
+from services.gateway.schemas import EstimateLevelResponse, ResponseModel
 from shared.errors import invalid_field_error
+from shared.http.request_model import RequestModel
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS, parse_time
 from shared.tracks.evidence import Odometry, PositionFix
 from shared.tracks.motion import DEFAULT_MOTION, MotionModel, motion_model

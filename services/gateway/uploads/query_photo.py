@@ -14,6 +14,7 @@ from services.gateway.similarity.search_params import SearchParams
 from services.gateway.uploads.multipart import FormFile, receive_form_file
 from shared.errors import Gone
 from shared.ids import new_id
+from shared.imaging.photo_header import PhotoHeader
 from shared.ingest.validation import check_photo_signature
 from shared.jobs import Job, JobKind, Priority
 from shared.storage.keys import query_key
@@ -44,12 +45,9 @@ def describe_query_job(
     map_id: UUID,
     filename: str,
     search_params: SearchParams,
-    focal_length: float | None,
+    header: PhotoHeader,
 ) -> Job:
-    """Create the job that describes a query photo and keeps the parameters of its search.
-
-    `focal_length` is that of its header, as a multiple of the longer side.
-    """
+    """Create the job of a query photo, which keeps the parameters of its search and its camera."""
     return Job(
         id=job_id,
         map_id=map_id,
@@ -58,7 +56,9 @@ def describe_query_job(
         params={
             "filename": filename,
             "search_params": search_params.model_dump(mode="json"),
-            "focal_length": focal_length,
+            "focal_length": header.focal_length,
+            "camera_key": header.camera_key,
+            "quarter_turns": header.quarter_turns,
         },
     )
 

@@ -128,8 +128,8 @@ class _BatchItemImporter:
             return
         if result.queued:
             self._wakeups.send()
-        if result.photo.object_key != key:
-            self._store.delete(key)
+        if result.unused_key is not None:
+            self._store.delete(result.unused_key)
 
     def _reserve_quota(self, job: Job, key_id: UUID | None) -> AbstractContextManager[None]:
         """Reserve a photo in the quota of the batch's API key."""
@@ -181,7 +181,7 @@ class _BatchItemImporter:
             # A photo without a job is already described; else the item ends as that job does.
             locked_item.state = JobState.RUNNING if result.job is not None else JobState.SUCCEEDED
             locked_item.photo_id, locked_item.photo_job_id = result.photo.id, result.photo.job_id
-            locked_item.already_there = result.photo.object_key != photo.received.key
+            locked_item.already_there = result.already_there
             return result
 
     def _fail_with_line(self, job: Job, item: BatchItem, error: PlacewiseError) -> None:

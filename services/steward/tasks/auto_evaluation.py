@@ -1,8 +1,4 @@
-"""Automatic evaluation: queues evaluations and word-weight fits for maps that have changed.
-
-An evaluation calibrates the threshold below which a query's answer is "not in this map". Word
-weights are fitted afterwards, for maps with a vocabulary of their own.
-"""
+"""Automatic evaluation: queues evaluations for maps that have changed."""
 
 from __future__ import annotations
 
@@ -18,19 +14,13 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, active_generation, latest_evaluation
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import Map, get_map_statistics, list_maps, lock_map
-from shared.catalog.vocabularies import vocabulary_standing, word_weights_unavailable_reason
 from shared.config.settings import Settings
 from shared.evaluation.places.probability import PlaceModel
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
-from shared.word_weights.record import parse_word_weights
 
 AUTO_SAMPLE_PHOTOS = 300  # enough for a threshold at a false-accept rate of 5 %
 REEVALUATE_SHARE = 0.2  # change of the photo count after which a map is evaluated again
-
-
-DueJob = tuple[JobKind, dict[str, Any]]
-"""Kind and params of an evaluation or word-weight job that a map needs now."""
 
 
 @periodic_task(2.0)
@@ -38,27 +28,32 @@ def evaluate_changed_maps(catalog: Catalog, settings: Settings) -> None:
     """Queue an evaluation for each idle map that has changed enough since its last one.
 
     Maps with fewer geotagged photos than AUTO_EVALUATE_PHOTOS are skipped; 0 turns automatic
-    evaluation off. Word weights are fitted once the evaluation is up to date.
+    evaluation off.
     """
     min_photos = settings.auto_evaluate_photos
     if not min_photos:
         return
     with catalog.read() as session:
-        due = [map_.id for map_ in list_maps(session) if _due_job(session, map_.id, min_photos)]
+        due = [map_.id for map_ in list_maps(session) if _due_params(session, map_.id, min_photos)]
     for map_id in due:
         with catalog.write() as session:
             lock_map(session, map_id)
-            due_job = _due_job(session, map_id, min_photos)
-            if due_job is None:
+            params = _due_params(session, map_id, min_photos)
+            if params is None:
                 continue  # another steward has queued it
-            kind, params = due_job
-            priority = Priority.EVALUATION
-            job = Job(id=new_id(), map_id=map_id, kind=kind, priority=priority, params=params)
-            session.add(job)
+            session.add(
+                Job(
+                    id=new_id(),
+                    map_id=map_id,
+                    kind=JobKind.EVALUATE,
+                    priority=Priority.EVALUATION,
+                    params=params,
+                )
+            )
 
 
-def _due_job(session: Session, map_id: UUID, min_photos: int) -> DueJob | None:
-    """Return the job that the map needs now, if any."""
+def _due_params(session: Session, map_id: UUID, min_photos: int) -> dict[str, Any] | None:
+    """Return the params of the evaluation that the map needs now, if any."""
     generation = active_generation(session, map_id)
     if generation is None or _is_busy(session, map_id):
         return None
@@ -83,12 +78,7 @@ def _due_job(session: Session, map_id: UUID, min_photos: int) -> DueJob | None:
         or _changed_enough(queries, evaluated[1])
         or _levels_changed(session, generation)
     ):
-        return JobKind.EVALUATE, params
-    if not _has_own_vocabulary(session, generation):
-        return None
-    weighted_count = _last_weighted_count(session, generation)
-    if weighted_count is None or _changed_enough(searchable, weighted_count):
-        return JobKind.WORD_WEIGHTS, params
+        return params
     return None
 
 
@@ -100,40 +90,22 @@ def _is_busy(session: Session, map_id: UUID) -> bool:
     return bool(session.scalar(select(unfinished)))
 
 
-def _has_own_vocabulary(session: Session, generation: Generation) -> bool:
-    """Weights for a foreign vocabulary never improved recall (lab/benchmarks/RESULTS.md)."""
-    return (
-        vocabulary_standing(session, generation) == "own"
-        and word_weights_unavailable_reason(session, generation) is None
-    )
-
-
 def _last_evaluated_counts(session: Session, generation: Generation) -> tuple[int, int] | None:
     """Return the numbers of photos and of labelled queries at the last evaluation."""
-    if failed := _failed_job_params(session, generation, JobKind.EVALUATE):
+    if failed := _failed_params(session, generation):
         return failed["searchable"], failed["labelled_queries"]
     last = latest_evaluation(session, generation.id)
     return None if last is None else (last.searchable, last.labelled_queries)
 
 
-def _last_weighted_count(session: Session, generation: Generation) -> int | None:
-    """Return the number of searchable photos when the word weights were last fitted."""
-    if failed := _failed_job_params(session, generation, JobKind.WORD_WEIGHTS):
-        return int(failed["searchable"])
-    record = parse_word_weights(generation.word_weights)
-    return None if record is None else record.searchable
-
-
-def _failed_job_params(
-    session: Session, generation: Generation, kind: JobKind
-) -> dict[str, Any] | None:
-    """Return the params of the map's last job of this kind if it was queued here and failed.
+def _failed_params(session: Session, generation: Generation) -> dict[str, Any] | None:
+    """Return the params of the map's last evaluation if it was queued here and failed.
 
     It counts as done, or it would be queued again in every run; its error is in the job.
     """
     job = session.scalar(
         select(Job)
-        .where(Job.map_id == generation.map_id, Job.kind == kind)
+        .where(Job.map_id == generation.map_id, Job.kind == JobKind.EVALUATE)
         .order_by(Job.id.desc())
         .limit(1)
     )
@@ -149,7 +121,7 @@ def _failed_job_params(
 
 def _levels_changed(session: Session, generation: Generation) -> bool:
     """Return whether labels have become paths, or names, since the place model was fitted."""
-    if generation.calibration is None or _failed_job_params(session, generation, JobKind.EVALUATE):
+    if generation.calibration is None or _failed_params(session, generation):
         return False
     model = PlaceModel.model_validate(generation.calibration)
     are_paths = session.get_one(Map, generation.map_id).place_labels_are_paths

@@ -22,6 +22,7 @@ from shared.catalog.vocabularies import next_fit_photos
 from shared.extractor_config.configs import DEFAULT_SAMPLE_PHOTOS
 from shared.jobs import Job, JobKind, Wakeups
 from shared.jobs.model_changes import get_unfinished_model_change, start_model_change
+from shared.jobs.wakeups import JobMessage
 
 log = logging.getLogger(__name__)
 
@@ -50,10 +51,11 @@ def fit_due_vocabularies(catalog: Catalog, wakeups: Wakeups) -> bool:
             if not is_fit_due(session, map_):
                 continue  # another steward has started the fit
             job = start_model_change(session, map_id, JobKind.FIT, dict(DEFAULT_FIT_PARAMS))
+            message = JobMessage.of(job, map_.name)
         log.info(
             "fitting a vocabulary for map %s, which has enough photos (job %s)", map_id, job.id
         )
-        wakeups.send()
+        wakeups.send(message)
     return len(settled) < len(due)
 
 

@@ -16,7 +16,7 @@ from services.steward.periodic_tasks import periodic_task
 from shared.catalog.database.base import db_now, db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.idempotency import IdempotencyRecord
-from shared.catalog.jobs import Job, JobState, Priority, claimable_condition
+from shared.catalog.jobs import Job, JobState
 from shared.catalog.maps import (
     CachedMapStatistics,
     Search,
@@ -31,40 +31,26 @@ from shared.catalog.webhooks import Delivery
 from shared.config.settings import Settings
 from shared.jobs import Wakeups
 from shared.jobs.runner import reclaim_expired_leases
-from shared.jobs.wakeups import WakeupQueue
+from shared.jobs.wakeups import report_jobs
 
 log = logging.getLogger(__name__)
 
 
 @periodic_task(1.0, counter="leases_expired")
-def reclaim_leases(catalog: Catalog, *, all_leases: bool = False) -> int:
+def reclaim_leases(catalog: Catalog, wakeups: Wakeups, *, all_leases: bool = False) -> int:
     """Requeue or fail the jobs of dead workers; see `reclaim_expired_leases`."""
     with catalog.write() as session:
         reclaimed = reclaim_expired_leases(session, all_leases=all_leases)
     if reclaimed:
-        log.warning("reclaimed %d jobs of workers that died", reclaimed)
-    return reclaimed
+        log.warning("reclaimed %d jobs of workers that died", len(reclaimed))
+        report_jobs(catalog, wakeups, [job.id for job in reclaimed])
+    return len(reclaimed)
 
 
 @periodic_task(2.0, counter="wakeups_resent")
 def resend_wakeups(catalog: Catalog, wakeups: Wakeups) -> int:
-    """Wake a worker for each queue with claimable jobs: the first wakeup may have been lost.
-
-    Returns:
-        The number of wakeups sent.
-    """
-    sent = 0
-    with catalog.read() as session:
-        for queue, condition in (
-            (WakeupQueue.QUERY, Job.priority >= Priority.QUERY),
-            (WakeupQueue.BULK, Job.priority < Priority.QUERY),
-        ):
-            if session.scalar(
-                select(exists(select(Job.id).where(claimable_condition(), condition)))
-            ):
-                wakeups.send(queue)
-                sent += 1
-    return sent
+    """Send the messages of jobs whose first one was lost; see `Wakeups.resend`."""
+    return wakeups.resend(catalog)
 
 
 RETENTION_ROWS_PER_TRANSACTION = 1000  # rows deleted in one transaction

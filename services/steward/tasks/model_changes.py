@@ -125,6 +125,11 @@ def advance_model_changes(
         if job.generation_id is not None:
             done = queued_chunks.setdefault(job.generation_id, set())
             _advance_model_change(catalog, wakeups, job, job.generation_id, done)
+    if waiting:
+        ids = [job.id for job in waiting]
+        now_ended = select(Job).where(Job.id.in_(ids), Job.state.not_in(UNFINISHED_STATES))
+        with catalog.read() as session:
+            wakeups.report(*session.scalars(now_ended))
 
 
 def _advance_model_change(

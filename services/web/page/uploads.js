@@ -14,8 +14,9 @@ const ERRORS_SHOWN = 100;
 const BUSY_TRIES = 20;
 const ZIP = /\.zip$/i;
 const TAR = /\.(tar|tgz|tar\.gz)$/i;
+const SIDECAR = /\.xmp$/i;
 const TABLE = /(^|\/)(photos\.csv|manifest\.jsonl)$/;
-const PHOTO = /\.(jpe?g|png|webp|bmp|tiff?|heic|heif)$/i;
+const PHOTO = /\.(jpe?g|jpe|jfif|png|webp|bmp|tiff?|heic|heif)$/i;
 
 /** One row of the list: a photo, or a batch of photos. */
 class Entry {
@@ -183,7 +184,9 @@ export class UploadQueue {
     const zips = files.filter(({ path }) => ZIP.test(path));
     const tars = files.filter(({ path }) => TAR.test(path));
     const photos = files.filter(({ file, path }) => !ZIP.test(path) && !TAR.test(path) && (file.type.startsWith("image/") || PHOTO.test(path) || files.length === 1));
-    let leftOut = files.length - zips.length - tars.length - photos.length;
+    const countSidecars = (some) => some.filter(({ path }) => SIDECAR.test(path) && some.length > 1).length;
+    let sidecars = countSidecars(files);
+    let leftOut = files.length - zips.length - tars.length - photos.length - sidecars;
     if (photos.length <= ONE_BY_ONE) this.entries.push(...photos.map((one) => new PhotoEntry(this, one, fields)));
     else this.entries.push(...this.#batches(photos.map(({ file, path }) => ({ path, size: file.size, read: () => file })), fields));
     this.start();
@@ -196,12 +199,14 @@ export class UploadQueue {
         if (inside.length) this.entries.push(...this.#batches(inside, fields));
         else notes.push(`${file.name} has no photos.`);
         notes.push(...tables.map(({ path }) => `${path} of ${file.name} is not read here: run placewise index.`));
-        leftOut += members.length - inside.length - tables.length;
+        sidecars += countSidecars(members);
+        leftOut += members.length - inside.length - tables.length - countSidecars(members);
       } catch (error) {
         notes.push(error.message);
       }
     }
     this.start();
+    if (sidecars) notes.push(`${plural(sidecars, "sidecar")} (XMP) not read here: run placewise index.`);
     if (leftOut) notes.push(`${plural(leftOut, "file")} left out: no photos.`);
     return notes;
   }

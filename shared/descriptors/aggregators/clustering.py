@@ -40,7 +40,8 @@ section 3):
     g     = the global token, by an MLP to `token_dim` numbers
     row   = [g / |g|, V_0 / |V_0|, V_1 / |V_1|, ...] / | . |    cluster-major, K x cluster_dim
 
-The authors' code orders the same numbers as cluster_dim x K (`published_order`).
+The authors' code orders the same numbers as cluster_dim x K (`published_order`). MegaLoc (Berton
+and Masone 2025) projects the row linearly to `out_dim` numbers, and normalises it again.
 
 The paper's backbone is DINOv2, whose class token is the global token. For a network without one, it
 is the mean of the map over its positions. The map needs more positions than there are clusters;
@@ -153,6 +154,7 @@ DUSTBIN_SCORE = 1.0  # initial value
 Share = Annotated[float, Field(ge=0, lt=1)]
 # Left out of the stored configuration if false, so that fingerprints of older models remain.
 StoredIfTrue = Annotated[bool, Field(exclude_if=operator.not_)]
+StoredIfGiven = Annotated[Size | None, Field(exclude_if=operator.not_)]
 
 
 class SALAD(Aggregator):
@@ -169,8 +171,11 @@ class SALAD(Aggregator):
         token_dim: Size = 256,
         dropout: Share = 0.3,
         published_order: StoredIfTrue = False,
+        out_dim: StoredIfGiven = None,
     ) -> None:
-        super().__init__(token_dim + num_clusters * cluster_dim)
+        width = token_dim + num_clusters * cluster_dim
+        super().__init__(out_dim or width)
+        self.projection = nn.Linear(width, out_dim) if out_dim else nn.Identity()
         self.published_order = published_order
         self.num_clusters = num_clusters
         self.features = _pointwise_mlp(in_channels, cluster_dim, dropout)
@@ -190,7 +195,8 @@ class SALAD(Aggregator):
         if token is None:
             token = maps.mean(dim=(-2, -1))
         global_token = normalize(self.token(token).float(), dim=-1)
-        return normalise_rows(torch.cat([global_token, clusters.flatten(1)], dim=1))
+        rows = normalise_rows(torch.cat([global_token, clusters.flatten(1)], dim=1))
+        return normalise_rows(self.projection(rows))
 
     def refusal(self, height: int, width: int) -> str | None:
         if height * width > self.num_clusters:

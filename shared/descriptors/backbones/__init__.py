@@ -16,6 +16,7 @@ import torch
 from torch.nn.functional import normalize
 
 from shared.descriptors.weight_files import OnProgress, first_error_line
+from shared.errors import PlacewiseError
 from shared.extractor_config.configs import MAX_WIDTH, ExtractorConfig
 from shared.extractor_config.names import NetworkInput
 from shared.imaging.preprocessing import Preprocessing
@@ -134,11 +135,13 @@ class NetworkBackbone(Backbone):
     def probe(self, height: int, width: int) -> tuple[Any, Any]:
         """Return what `find_descriptor_fault` checks: for two images of noise, and for the first.
 
-        Raises ValueError with a reason if the network raises anything.
+        Raises ValueError with a reason if the network raises anything but a PlacewiseError.
         """
         photos = probe_photos(height, width)
         try:
             return self._forward(photos), self._forward(photos[:1])
+        except PlacewiseError:
+            raise
         except Exception as error:  # networks of others may raise anything
             raise ValueError(
                 f"with 2 photos of {height} x {width} pixels it fails with "

@@ -6,16 +6,17 @@ with the layout `nhwc`, or (B, patches, D). The name's options say which, and wh
 that are loaded, so that a file that is replaced never continues rows of another one.
 
 A TorchScript file holds code, which runs with the rights of this process: callers have decided that
-it may. An ONNX file holds operators and numbers. It may name other files for its numbers, or ask
-for any amount of memory: both are refused.
+it may. An ONNX file holds operators and numbers. It may name other files for its numbers, which is
+refused, ask for any amount of memory, or loop for ever: it runs in an `OnnxProcess`.
 """
 
 from __future__ import annotations
 
-import functools
+import contextlib
 import hashlib
+import importlib.util
 import io
-import os
+import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -24,14 +25,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from shared.descriptors.backbones import NetworkBackbone, find_descriptor_fault
+from shared.descriptors.backbones import NetworkBackbone, find_descriptor_fault, probe_photos
+from shared.descriptors.onnx_process import OnnxProcess, UnsuitableInput
 from shared.descriptors.weight_files import first_error_line
-from shared.errors import Misconfigured, Unprocessable
+from shared.errors import Misconfigured, PlacewiseError, Unprocessable
 from shared.extractor_config.configs import ExtractorConfig
 from shared.extractor_config.names import INPUT_OPTIONS, ONNX_PREFIX, TORCHSCRIPT_PREFIX
 from shared.imaging.preprocessing import get_preprocessing
 
-ONNX_MEMORY_BYTES = 4_000_000_000  # of all ONNX networks of a process, with their weights
+FIXED_BATCHES = (4, 8, 16, 32, 64)
+"""Tried with a network that fails with two photos and one"""
 
 Network = Callable[[torch.Tensor], Any]
 
@@ -47,6 +50,7 @@ class ExportedBackbone(NetworkBackbone):
         *,
         licence: str = "not stated",
         card: dict[str, Any] | None = None,
+        is_stopping: Callable[[], bool] = lambda: False,
     ) -> None:
         """Load the content of a file, and check it on two images of noise.
 
@@ -56,10 +60,12 @@ class ExportedBackbone(NetworkBackbone):
             device: Where TorchScript computes; ONNX computes on the CPU.
             licence: Licence of the weights, as its user states it.
             card: Model card: where the file comes from.
+            is_stopping: Whether to end a pass of an ONNX file, because this process is to stop.
 
         Raises:
             Unprocessable: `model_unusable`, with what was expected and what came.
             Misconfigured: `onnx_missing`.
+            Unavailable: `extractor_stopping`.
         """
         assert config.model is not None
         assert config.input is not None
@@ -75,12 +81,14 @@ class ExportedBackbone(NetworkBackbone):
         self.device = device
         try:
             if config.model.prefix == ONNX_PREFIX:
-                self.network = _open_onnx(data)
+                self.network = _open_onnx(data, is_stopping)
             else:
                 self.network = _open_torchscript(data, device)
-        except Misconfigured:
+        except PlacewiseError:
             raise
-        except Exception as error:  # ONNX Runtime's own types have no other base
+        except UnsuitableInput as error:
+            raise self._unusable_error(str(error)) from error
+        except Exception as error:  # what is wrong with a file may be anything
             raise self._unusable_error(
                 f"it can't be read ({first_error_line(error)}). Weights of an ONNX file that are "
                 "in another file are never read: export it with external_data=False"
@@ -119,7 +127,8 @@ class ExportedBackbone(NetworkBackbone):
         try:
             both, alone = self.probe(*size)
         except ValueError as error:
-            raise self._unusable_error(str(error)) from error
+            reason = str(error) + self._find_cause(probe_photos(*size))
+            raise self._unusable_error(reason) from error
         fault = None
         if self.layer == "patches":
             shape = tuple(getattr(both, "shape", ()))
@@ -136,6 +145,24 @@ class ExportedBackbone(NetworkBackbone):
         if fault is not None:
             raise self._unusable_error(fault)
         return int(both.shape[1])
+
+    @torch.inference_mode()
+    def _find_cause(self, photos: torch.Tensor) -> str:
+        """Return, as part of a sentence, why the network fails with two photos and one.
+
+        An ONNX file names its batch itself, and each of its passes may take a minute.
+        """
+        assert self._config.model is not None
+        if self._config.model.prefix == ONNX_PREFIX:
+            return ""
+        graph = getattr(self.network, "inlined_graph", "")
+        if device := re.search(r'"(cuda(:\d+)?)"', str(graph)):
+            return f". Its code names the device {device[1]}: trace or script it on the CPU"
+        for count in FIXED_BATCHES:
+            with contextlib.suppress(Exception):  # networks of others may raise anything
+                self._forward(photos[:1].expand(count, -1, -1, -1))
+                return f". It takes batches of {count} only: export it for any number of photos"
+        return ""
 
     def _unusable_error(self, reason: str) -> Unprocessable:
         return Unprocessable(
@@ -154,7 +181,7 @@ def exported_prefix(path: Path, filename: str) -> str | None:
         return ONNX_PREFIX
     try:
         records = torch._C.PyTorchFileReader(str(path)).get_all_records()
-    except RuntimeError:
+    except (RuntimeError, ValueError):  # ValueError: names that are not UTF-8
         return None  # not an archive of PyTorch
     return TORCHSCRIPT_PREFIX if "constants.pkl" in records else None
 
@@ -162,54 +189,23 @@ def exported_prefix(path: Path, filename: str) -> str | None:
 def _open_torchscript(data: bytes, device: torch.device) -> Network:
     """Load a TorchScript module, which executes its code."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # of a format that others go on publishing
+        warnings.simplefilter("ignore")  # of a format that others go on publishing
         module = torch.jit.load(io.BytesIO(data), map_location=device)  # type: ignore[no-untyped-call]
     network: Network = module.eval()
-    return network
+    stored = next((each.dtype for each in module.parameters()), torch.float32)
+    if stored == torch.float32 or not stored.is_floating_point:
+        return network
+    return lambda batch: network(batch.to(stored) if batch.is_floating_point() else batch)
 
 
-def _open_onnx(data: bytes) -> Network:
-    """Open a session; raises Misconfigured (`onnx_missing`), RuntimeError and ValueError."""
-    try:
-        import onnxruntime
-    except ImportError:
+def _open_onnx(data: bytes, is_stopping: Callable[[], bool]) -> Network:
+    """Open the file in a process of its own; raises Misconfigured (`onnx_missing`), PassFailed."""
+    if importlib.util.find_spec("onnxruntime") is None:
         raise Misconfigured(
             "onnx_missing",
             "ONNX files need the package onnxruntime, which is not installed. Install the extra "
             "`onnx` where the extractor runs: uv pip install '.[onnx]' in the repository.",
-        ) from None
-    _limit_onnx_memory()
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = torch.get_num_threads()
-    options.log_severity_level = 4  # errors are raised, too
-    options.add_session_config_entry("session.use_env_allocators", "1")
-    # By default, files that it names are read from the working directory. Nothing is in this one.
-    options.add_session_config_entry(
-        "session.model_external_initializers_file_folder_path", os.devnull
-    )
-    session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    inputs = session.get_inputs()
-    if len(inputs) != 1:
-        raise ValueError(f"it has {len(inputs)} inputs, expected photos only")
-    output = session.get_outputs()[0].name
-    one_by_one = inputs[0].shape[:1] == [1]  # as many exports are
-
-    def run(batch: torch.Tensor) -> torch.Tensor:
-        array = np.ascontiguousarray(batch.cpu().numpy())
-        parts = np.split(array, len(array)) if one_by_one else [array]
-        rows = [session.run([output], {inputs[0].name: part})[0] for part in parts]
-        return torch.from_numpy(np.concatenate(rows))
-
-    return run
-
-
-@functools.cache
-def _limit_onnx_memory() -> None:
-    """Limit what the sessions of this process can allocate; a session that needs more fails."""
-    import onnxruntime
-
-    memory = onnxruntime.OrtMemoryInfo(
-        "Cpu", onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, onnxruntime.OrtMemType.DEFAULT
-    )
-    limits = onnxruntime.OrtArenaCfg({"max_mem": ONNX_MEMORY_BYTES, "arena_extend_strategy": 1})
-    onnxruntime.create_and_register_allocator(memory, limits)
+        )
+    process = OnnxProcess(data, torch.get_num_threads(), is_stopping)
+    process.open()
+    return lambda batch: torch.from_numpy(process(np.ascontiguousarray(batch.cpu().numpy())))

@@ -4,7 +4,10 @@ ResNet (He et al. 2016) and ResNeXt (Xie et al. 2017) by torchvision: strides 4,
 
 Swin-T (Liu et al. 2021) by torchvision: strides 4, 8, 16, 32; photos of any size.
 
-EfficientNet-B0 (Tan and Le 2019) by torchvision, and its Lite0 by timm: stages 1 to 7 are the
+VGG-16 (Simonyan and Zisserman 2015) by torchvision, without its last activation and pooling:
+strides 2, 4, 8, 16.
+
+EfficientNet-B0 to B7 (Tan and Le 2019) by torchvision, and its Lite0 by timm: stages 1 to 7 are the
 groups of blocks (strides 2, 4, 8, 16, 16, 32, 32), the 8th is the convolution to 1,280 channels
 before the classifier.
 
@@ -18,6 +21,7 @@ weights raise a Misconfigured that names the ways to get them.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -38,7 +42,7 @@ from shared.descriptors.backbones.dinov2 import (
 from shared.descriptors.backbones.dinov2 import STD as IMAGENET_STD
 from shared.descriptors.backbones.dinov2_weights import find_or_download_weights, open_weights
 from shared.descriptors.backbones.efficientnet_lite0 import MEAN, STD, published_network
-from shared.descriptors.vpr_models.config import STAGES, VprModelConfig
+from shared.descriptors.vpr_models.config import STAGES, VGG16_POOLINGS, VprModelConfig
 from shared.descriptors.weight_files import (
     TENSOR_READ_ERRORS,
     download_file,
@@ -282,7 +286,15 @@ def _build_swin(name: str, pretrained: bool, weights: Path | None) -> StagedBack
     return _SwinBackbone(stem, [first, *merged], network.norm)
 
 
-def _build_efficientnet_b0(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
+def _build_vgg16(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
+    """Build VGG-16; its modules keep their numbers in torchvision's network."""
+    layers = _load_torchvision_network(name, pretrained, weights).features
+    begins = [*VGG16_POOLINGS, len(layers) - 2]
+    stages = [layers[begin:end] for begin, end in itertools.pairwise(begins)]
+    return StagedBackbone(layers[: begins[0]], stages)
+
+
+def _build_efficientnet(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
     """Build an EfficientNet of torchvision."""
     stem, *stages = _load_torchvision_network(name, pretrained, weights).features
     return StagedBackbone(stem, stages)
@@ -331,7 +343,8 @@ _BUILDERS: dict[str, BackboneBuilder] = {
         ("resnet18", "resnet34", "resnet50", "resnet101", "resnet152", "resnext50_32x4d"),
         _build_resnet,
     ),
-    "efficientnet_b0": _build_efficientnet_b0,
+    "vgg16": _build_vgg16,
+    **{f"efficientnet_b{size}": _build_efficientnet for size in range(8)},
     "efficientnet_lite0": _build_efficientnet_lite0,
     "swin_t": _build_swin,
     **{f"dinov2_{size}": build_dinov2 for size in SHAPES},

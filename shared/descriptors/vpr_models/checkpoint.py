@@ -45,12 +45,16 @@ from shared.descriptors.vpr_models.published_checkpoints import (
 from shared.descriptors.weight_files import (
     TENSOR_READ_ERRORS,
     check_declared_size,
+    is_safetensors,
     load_tensors,
+    open_tensor_file,
     shape_differences,
 )
 from shared.errors import NotFound, PlacewiseError, Unavailable, Unprocessable
 
 STATE_DICT_PREFIX = "model."
+STATE_DICT_NAMES = ("state_dict", "model_state_dict", "model")
+"""Entries of a checkpoint that hold the network's tensors"""
 FIELDS_WITHOUT_EFFECT = {"pretrained", "layers_to_freeze"}  # for loaded weights
 
 
@@ -79,9 +83,9 @@ def load_checkpoint(path: Path) -> Checkpoint:
     """
     stored = _read(path)
     parameters = stored.get("hyper_parameters", {})
-    tensors = stored.get("state_dict", stored.get("model_state_dict", stored))
-    if not isinstance(parameters, Mapping) or not isinstance(tensors, Mapping):
-        raise _checkpoint_unusable_error(path, "it has no mapping of tensors")
+    tensors = _find_tensors(stored, path)
+    if not isinstance(parameters, Mapping):
+        raise _checkpoint_unusable_error(path, "its hyper_parameters are no mapping")
     if isinstance(parameters.get("model"), Mapping):
         config = VprModelConfig.parse({**parameters["model"], "pretrained": False})
         own_tensors = {
@@ -128,6 +132,9 @@ def _read(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise NotFound("checkpoint_not_found", f"There is no checkpoint {path}.")
     try:
+        if is_safetensors(path):
+            file = open_tensor_file(path)
+            return {name: file.read(name) for name in file.shapes}
         stored = load_tensors(path)
     except TENSOR_READ_ERRORS as error:
         raise Unprocessable(
@@ -138,6 +145,30 @@ def _read(path: Path) -> dict[str, Any]:
     if not isinstance(stored, dict):
         raise _checkpoint_unusable_error(path, f"it holds a {type(stored).__name__}")
     return stored
+
+
+def _find_tensors(stored: dict[str, Any], path: Path) -> Mapping[str, Any]:
+    """Return the named tensors of a file, which may be an entry of it beside others."""
+
+    def holds_tensors(entry: Any) -> bool:
+        return isinstance(entry, Mapping) and any(
+            isinstance(value, torch.Tensor) for value in entry.values()
+        )
+
+    found: dict[str, Mapping[str, Any]] = {
+        name: entry for name, entry in stored.items() if holds_tensors(entry)
+    }
+    for name in STATE_DICT_NAMES:
+        if name in found:
+            return found[name]
+    if holds_tensors(stored):
+        return stored
+    if len(found) != 1:
+        names = ", ".join(f"{name!s:.60}" for name in found or stored) or "nothing"
+        raise _checkpoint_unusable_error(
+            path, f"{len(found)} of its entries hold tensors, and one should ({names})"
+        )
+    return next(iter(found.values()))
 
 
 def _known_reason(error: Exception) -> str:

@@ -17,7 +17,8 @@ STAGES = {
     "resnet101": 4,
     "resnet152": 4,
     "resnext50_32x4d": 4,
-    "efficientnet_b0": 8,
+    "vgg16": 4,
+    **{f"efficientnet_b{size}": 8 for size in range(8)},
     "efficientnet_lite0": 8,
     "swin_t": 4,
     "dinov2_vits14": 12,
@@ -25,8 +26,12 @@ STAGES = {
     "dinov2_vitl14": 24,
     "dinov2_vitg14": 40,
 }
-"""Backbones and their number of stages after the stem: layer1 to layer4 of a ResNet, the blocks of
-a transformer. The 8th stage of an EfficientNet is the convolution before its classifier."""
+"""Backbones and their number of stages after the stem: layer1 to layer4 of a ResNet, poolings of
+VGG-16 with what follows them, the blocks of a transformer. The 8th stage of an EfficientNet is the
+convolution before its classifier."""
+
+VGG16_POOLINGS = (4, 9, 16, 23)
+"""Numbers of the layers in torchvision's VGG-16 with which a stage begins"""
 
 NORMED_BACKBONES = ("dinov2", "swin")
 

@@ -2,13 +2,17 @@
 
     code                           names of its tensors
     gsv_xs, gsv-cities, MixVPR     backbone.model.layer1
-    CosPlace, EigenPlaces          backbone.4, aggregation.3
+    CosPlace, EigenPlaces          backbone.4, aggregation.3; VGG-16: backbone.28,
+                                   EfficientNet: backbone.8.0 or backbone.0.8.0
     BoQ                            backbone.net.4 or backbone.dino.blocks.0
-    SALAD                          backbone.model.blocks.0
+    SALAD, MegaLoc                 backbone.model.blocks.0, aggregator.agg
     OpenVPRLab                     backbone.frozen_layers.1 or backbone.dino.blocks.0
 
 gsv_xs and OpenVPRLab write checkpoints of PyTorch Lightning with `hyper_parameters`; the others
 publish the tensors alone.
+
+Code that trains on several GPUs, compiles or wraps the network puts `module.`, `_orig_mod.` or the
+name of an attribute before these names.
 
 Files of tensors do not describe their network. It is inferred from the tensors' names and shapes;
 the size of photos is that of the published results, and Conv-AP has 2 x 2 cells. BoQ and
@@ -17,6 +21,7 @@ OpenVPRLab resize photos with bicubic interpolation, the others with bilinear.
 
 from __future__ import annotations
 
+import bisect
 import math
 import re
 from collections.abc import Mapping
@@ -25,7 +30,7 @@ from typing import Any
 import torch
 
 from shared.descriptors.backbones.dinov2 import SHAPES
-from shared.descriptors.vpr_models.config import NO_FREEZING, VprModelConfig
+from shared.descriptors.vpr_models.config import NO_FREEZING, STAGES, VGG16_POOLINGS, VprModelConfig
 
 GSV_IMAGE_SIZE = (320, 320)  # pixels, of all published runs
 GSV_MODEL_ARGUMENTS = (
@@ -55,6 +60,7 @@ _RENAMED: Replacements = (
     (r"backbone\.(?:model|dino)\.pos_embed$", "backbone.stem.positions"),
     (r"backbone\.(?:model|dino)\.blocks\.", "backbone.stages."),
     (r"backbone\.model\.norm\.", "backbone.norm."),
+    (r"aggregator\.agg\.", "aggregator."),
     (r"aggregation\.1\.p$", "aggregator.gem.p"),
     (r"aggregation\.3\.", "aggregator.fc."),
 )
@@ -67,6 +73,7 @@ _AGGREGATORS: dict[str, tuple[str, Replacements]] = {
             (r"cluster_features\.", "features."),
             (r"score\.", "scores."),
             (r"dust_bin$", "dustbin"),
+            (r"linear\.", "projection."),
         ),
     ),
     "BoQ": (
@@ -107,6 +114,16 @@ _RESNETS = {
     "resnext50_32x4d": ((128, 64, 1, 1), (3, 4, 6, 3)),
 }
 """Shape of the first convolution of the first stage, and the number of blocks of each stage"""
+_EFFICIENTNETS = {
+    1280: "efficientnet_b0",
+    1408: "efficientnet_b2",
+    1536: "efficientnet_b3",
+    1792: "efficientnet_b4",
+    2048: "efficientnet_b5",
+    2304: "efficientnet_b6",
+    2560: "efficientnet_b7",
+}
+"""By the channels of their last convolution; B1 has those of B0, and more blocks"""
 
 
 def read_published_checkpoint(
@@ -125,12 +142,24 @@ def read_published_checkpoint(
         Unprocessable: As `VprModelConfig.parse`.
     """
     try:
+        tensors = _without_wrappers(tensors)
         aggregator, renamed = _rename(tensors)
         if {"backbone_arch", "agg_arch"} <= parameters.keys():
             return _read_gsv_config(parameters), renamed
         return _infer_config(aggregator, parameters, tensors, renamed), renamed
     except (KeyError, IndexError, AttributeError, TypeError, StopIteration) as error:
-        raise ValueError("its tensors are not those of a known network") from error
+        first = ", ".join(f"{name!s:.60}" for name in list(tensors)[:3])
+        raise ValueError(
+            f"its tensors are not those of a known network (the first are {first})"
+        ) from error
+
+
+def _without_wrappers(tensors: Mapping[str, Any]) -> dict[str, Any]:
+    """Remove what DataParallel, torch.compile and wrapping modules put before the names."""
+    names = {name: re.sub(r"(?<![^.])(?:module|_orig_mod)\.", "", name) for name in tensors}
+    inner = [re.match(r"(.*?)backbone\.", name) for name in names.values()]
+    before = min((match[1] for match in inner if match), key=len, default="")
+    return {names[name].removeprefix(before): tensor for name, tensor in tensors.items()}
 
 
 def _rename(tensors: Mapping[str, Any]) -> tuple[str, Tensors]:
@@ -147,6 +176,7 @@ def _rename(tensors: Mapping[str, Any]) -> tuple[str, Tensors]:
             lambda match: f"backbone.layers.{int(match[1]) + len(frozen)}",
             name,
         )
+        name = _rename_layer(name, tensors)
         for pattern, first in _BACKBONE_STAGES:
             if stage := re.match(pattern, name):
                 name = f"backbone.stages.{int(stage[1]) - first}.{name[stage.end() :]}"
@@ -164,6 +194,22 @@ def _rename(tensors: Mapping[str, Any]) -> tuple[str, Tensors]:
         for name, tensor in ours.items()
         if name.startswith((prefix, "backbone."))
     }
+
+
+def _rename_layer(name: str, tensors: Mapping[str, Any]) -> str:
+    """Return our name of a tensor of VGG-16 or an EfficientNet, whose layers are one sequence."""
+    if "backbone.28.weight" in tensors:  # the last convolution of VGG-16
+        before, is_vgg = "backbone.", True
+    else:
+        before, is_vgg = ("backbone.", "backbone.0.")["backbone.0.8.0.weight" in tensors], False
+        if f"{before}8.0.weight" not in tensors:
+            return name
+    number, _, rest = name.removeprefix(before).partition(".")
+    if not name.startswith(before) or not number.isdigit():
+        return name
+    stage = bisect.bisect(VGG16_POOLINGS, int(number)) if is_vgg else int(number)
+    part = f"stages.{stage - 1}" if stage else "stem"
+    return f"backbone.{part}.{number + '.' if is_vgg else ''}{rest}"
 
 
 def _replace(name: str, replacements: Replacements) -> str:
@@ -207,14 +253,13 @@ def _infer_config(
         size = photos.get("val_image_size") or photos["train_image_size"]
         given = parameters["aggregator"]["params"]
         arguments |= {name: given[name] for name in ("s1", "s2") if name in given}
-    is_resnet = backbone in _RESNETS
     return VprModelConfig.parse(
         {
             "backbone_arch": backbone,
             "pretrained": False,
             "layers_to_freeze": NO_FREEZING,
-            "layers_to_crop": [stages + 1] if is_resnet and stages < 4 else [],
-            "backbone_norm": is_resnet or "backbone.norm.weight" in ours,
+            "layers_to_crop": [stages + 1] if stages < STAGES[backbone] else [],
+            "backbone_norm": not backbone.startswith("dinov2") or "backbone.norm.weight" in ours,
             "agg_arch": aggregator,
             "agg_config": arguments,
             "image_size": size,
@@ -232,6 +277,13 @@ def _infer_backbone(ours: Tensors) -> tuple[str, int]:
             for size, shape in SHAPES.items()
             if shape.width == width
         )
+    if "backbone.stages.3.28.weight" in ours:
+        return "vgg16", STAGES["vgg16"]
+    if "backbone.stages.7.0.weight" in ours:
+        name = _EFFICIENTNETS[len(ours["backbone.stages.7.0.weight"])]
+        if name == "efficientnet_b0" and "backbone.stages.0.1.block.0.0.weight" in ours:
+            name = "efficientnet_b1"
+        return name, STAGES[name]
     found = [re.match(r"backbone\.stages\.(\d+)\.(\d+)\.", name) for name in ours]
     last_blocks: dict[int, int] = {}
     for match in filter(None, found):
@@ -260,6 +312,9 @@ def _infer_arguments(aggregator: str, ours: Tensors) -> dict[str, Any]:
                 "cluster_dim": size("features.3.weight"),
                 "token_dim": size("token.2.weight"),
                 "published_order": True,
+                "out_dim": size("projection.weight")
+                if "aggregator.projection.weight" in ours
+                else None,
             }
         case "BoQ":
             queries = size("blocks.0.queries", 1)

@@ -14,7 +14,7 @@ import numpy as np
 
 from shared.evaluation.bootstrap import bootstrap_intervals
 from shared.evaluation.calibration import expected_calibration_error
-from shared.evaluation.places.fit import PlaceSample, fit_place_model
+from shared.evaluation.places.fit import MapScores, PlaceSample, fit_place_model
 from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import PlaceModel
 from shared.evaluation.places.samples import OWN_PHOTO_RULE
@@ -37,10 +37,10 @@ def evaluate_places(
     samples: Sequence[PlaceSample],
     labelled: Sequence[PlaceSample],
     scheme: LevelScheme,
-    spread: float,
+    scores: MapScores,
 ) -> PlaceEvaluation:
     """Fit the model of a map (`fit_place_model`), and measure it on held-out samples."""
-    fitted = fit_place_model(samples, labelled, scheme, spread)
+    fitted = fit_place_model(samples, labelled, scheme, scores)
     if not fitted.held_out:
         return PlaceEvaluation(fitted.model, None)
     positions = range(max(len(estimate.probabilities) for estimate in fitted.held_out))

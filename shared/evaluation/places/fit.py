@@ -5,7 +5,7 @@ coefficients: a small map stays near them, a large one follows its own photos.
 
 The samples are the map's own photos, each searched without itself, and *impostors*: the same photos
 searched as if the map had no photo of a place that shows them. Impostors have the total weight
-`OUT_OF_MAP_SHARE`: that share of queries from outside the map is assumed. Labelled queries, if
+`UNMAPPED_SHARE`: that share of queries of places without a photo is assumed. Labelled queries, if
 there are enough, refine the coefficients, with those of the own photos as the prior. Thresholds are
 chosen on predictions of samples that the model was not fitted on (cross-validation).
 
@@ -17,14 +17,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from shared.evaluation.places.levels import CandidateLevel, FloatArray, LevelScheme
 from shared.evaluation.places.probability import (
-    OUT_OF_MAP_SHARE,
+    UNMAPPED_SHARE,
+    Background,
     Coefficients,
+    Elsewhere,
+    MapExtent,
     PlaceModel,
     PlacePrior,
     extended,
@@ -34,13 +37,13 @@ from shared.evaluation.places.probability import (
 from shared.evaluation.places.thresholds import (
     CERTAINTIES,
     HeldOutEstimate,
-    choose_in_map_limit,
-    choose_thresholds,
+    choose_threshold,
 )
 
 MIN_OWN_PHOTOS = 20
 MIN_LABELLED_QUERIES = 40
 PRIOR_PRECISION = 2.0  # of each coefficient of a standardised feature
+ELSEWHERE_PRECISION = 0.2  # what is known of another extractor says little
 NEWTON_STEPS = 50
 FOLDS = 5
 
@@ -62,6 +65,18 @@ class PlaceSample:
 
 
 @dataclass(frozen=True, slots=True)
+class MapScores:
+    """What is known of a map's scores and size before its model is fitted."""
+
+    spread: float
+    """unit of score differences of the samples' features"""
+    background: Background
+    extent: MapExtent = field(default_factory=MapExtent)
+    extractor: str = ""
+    """of a map with a vocabulary of its own, whose foreign scores may be known; else empty"""
+
+
+@dataclass(frozen=True, slots=True)
 class FittedPlaceModel:
     """A model with the held-out estimates that its thresholds were chosen on."""
 
@@ -75,14 +90,13 @@ def fit_place_model(
     samples: Sequence[PlaceSample],
     labelled: Sequence[PlaceSample],
     scheme: LevelScheme,
-    spread: float,
+    scores: MapScores,
 ) -> FittedPlaceModel:
     """Fit the model of a map.
 
     Args:
         samples: The map's own photos and their impostors.
         labelled: Labelled queries, taken in another session than the photos that they match.
-        spread: Unit of score differences of the samples' features.
 
     Returns:
         The model; the prior with fewer than MIN_OWN_PHOTOS own photos and fewer than
@@ -93,16 +107,13 @@ def fit_place_model(
         labelled = ()
     if own < MIN_OWN_PHOTOS and not labelled:
         return FittedPlaceModel(PlaceModel(), [], [])
-    own_held_out, labelled_held_out = _predict_held_out(samples, labelled, scheme, spread)
+    own_held_out, labelled_held_out = _predict_held_out(samples, labelled, scheme, scores)
     impostors = [s for s in own_held_out if s.left_out is not None]
-    thresholds = tuple(
-        choose_thresholds(labelled_held_out or own_held_out, impostors, certainty)
-        for certainty in CERTAINTIES
-    )
-    model = _fit_coefficients(samples, labelled, scheme, spread).model_copy(
+    judged = labelled_held_out or own_held_out
+    thresholds = tuple(choose_threshold(judged, certainty) for certainty in CERTAINTIES)
+    model = _fit_coefficients(samples, labelled, scheme, scores).model_copy(
         update={
             "thresholds": thresholds,
-            "in_map_limit": choose_in_map_limit(impostors),
             "own_photos": own,
         }
     )
@@ -114,7 +125,7 @@ def _fit_coefficients(
     samples: Sequence[PlaceSample],
     labelled: Sequence[PlaceSample],
     scheme: LevelScheme,
-    spread: float,
+    scores: MapScores,
 ) -> PlaceModel:
     prior = shipped_prior()
     positions = max((len(sample.levels) for sample in [*samples, *labelled]), default=0)
@@ -125,9 +136,11 @@ def _fit_coefficients(
     return PlaceModel(
         source="labelled_queries" if labelled else "own_photos",
         scheme=scheme,
-        spread=spread,
+        spread=scores.spread,
         levels=tuple(levels),
-        not_in_map=fit_map_estimate(not_in_map_table(samples), prior.not_in_map),
+        missing_place=fit_map_estimate(missing_place_table(samples), prior.missing_place),
+        elsewhere=_fit_elsewhere(samples, scores),
+        extent=scores.extent,
         labelled_queries=len(labelled),
     )
 
@@ -155,7 +168,7 @@ class RegressionTable:
 
 
 def _level_table(samples: Sequence[PlaceSample], position: int) -> RegressionTable:
-    weights = sample_weights(samples, OUT_OF_MAP_SHARE)
+    weights = sample_weights(samples, UNMAPPED_SHARE)
     return RegressionTable.of_rows(
         (sample.levels[position].features, right, weight)
         for sample, weight in zip(samples, weights, strict=True)
@@ -163,14 +176,42 @@ def _level_table(samples: Sequence[PlaceSample], position: int) -> RegressionTab
     )
 
 
-def not_in_map_table(samples: Sequence[PlaceSample]) -> RegressionTable:
-    """Return the samples of "not in the map", half of them impostors by weight."""
+def missing_place_table(samples: Sequence[PlaceSample]) -> RegressionTable:
+    """Return the samples of a missing place, half of them impostors by weight."""
     samples = [s for s in samples if s.left_out is not None or not s.is_alone]
     weights = sample_weights(samples, 0.5)
     return RegressionTable.of_rows(
         (sample.levels[0].features, sample.left_out is not None, weight)
         for sample, weight in zip(samples, weights, strict=True)
     )
+
+
+def _fit_elsewhere(samples: Sequence[PlaceSample], scores: MapScores) -> Elsewhere:
+    """Return the log-odds of photos of elsewhere.
+
+    Where the scores of foreign photos are not known, the map's own photos without the largest part
+    of the map that shows their place stand for them: they are more similar to the map, so that too
+    few queries are answered rather than too many.
+    """
+    prior = shipped_prior()
+    if scores.extractor and (known := prior.elsewhere.get(scores.extractor)):
+        return known
+    other = prior.elsewhere[""].model_copy(update={"background": scores.background})
+    farthest = max((s.left_out or "" for s in samples), default="")
+    own = [s for s in samples if s.left_out is None and not s.is_alone]
+    away = [s for s in samples if s.left_out == farthest and farthest]
+    table = RegressionTable.of_rows(
+        (other.features(sample.levels), sample.left_out is not None, weight)
+        for group in (own, away)
+        for sample, weight in ((each, len(own) / max(1, len(group)) / 2) for each in group)
+    )
+    if not own or not away:
+        return other
+    count = table.features.shape[1]
+    plain = PlacePrior(means=(0.0,) * count, scales=(1.0,) * count, level=(), missing_place=())
+    name = "coefficients" if count == 2 else "matched"
+    fitted = fit_map_estimate(table, getattr(other, name), plain, ELSEWHERE_PRECISION)
+    return other.model_copy(update={name: fitted})
 
 
 def sample_weights(samples: Sequence[PlaceSample], share: float) -> list[float]:
@@ -229,7 +270,7 @@ def _predict_held_out(
     samples: Sequence[PlaceSample],
     labelled: Sequence[PlaceSample],
     scheme: LevelScheme,
-    spread: float,
+    scores: MapScores,
 ) -> tuple[list[HeldOutEstimate], list[HeldOutEstimate]]:
     """Predict the samples and the labelled queries by cross-validation."""
     predicted: tuple[list[HeldOutEstimate], list[HeldOutEstimate]] = ([], [])
@@ -237,12 +278,13 @@ def _predict_held_out(
         own, queries = (
             [s for s in each if s.photo % FOLDS != fold] for each in (samples, labelled)
         )
-        model = _fit_coefficients(own, queries, scheme, spread)
+        model = _fit_coefficients(own, queries, scheme, scores)
         for each, into in zip((samples, labelled), predicted, strict=True):
             held_out = [s for s in each if s.photo % FOLDS == fold]
-            weights = sample_weights(held_out, OUT_OF_MAP_SHARE)
-            into += [
-                HeldOutEstimate(*model.probabilities(s.levels), s.is_right, s.left_out, weight)
-                for s, weight in zip(held_out, weights, strict=True)
-            ]
+            weights = sample_weights(held_out, UNMAPPED_SHARE)
+            for sample, weight in zip(held_out, weights, strict=True):
+                levels = model.extent.end_levels(sample.levels)
+                right = [*sample.is_right[: len(levels) - 1], True]
+                probabilities = model.probabilities(levels)
+                into.append(HeldOutEstimate(*probabilities, right, sample.left_out, weight))
     return predicted

@@ -69,6 +69,9 @@ class CandidateLevel:
     radius_m: float | None = None
     features: FloatArray = field(default_factory=lambda: np.zeros(0))
     """(F,) FEATURES, followed by MATCH_FEATURES if the ranking was matched"""
+    best_score: float = 0.0
+    """of the photo of the map that is most similar to the query"""
+    is_whole_map: bool = False
 
     def contains(self, location: PhotoLocation) -> bool:
         """Return whether a location lies in the level."""
@@ -145,7 +148,7 @@ def candidate_levels(
         if matched:
             of_matches = match_features(level, ranking[:MATCHED_PHOTOS])
             features = np.concatenate([features, of_matches])
-        described.append(replace(level, features=features))
+        described.append(replace(level, features=features, best_score=ranking[0].score))
     return described
 
 

@@ -1,15 +1,22 @@
 """Probabilities of a place estimate: of each level, and that the place is not in the map.
 
-Each is a logistic regression on the features of the ranking (`level_features`). `fit` fits
-them to a map; without a fit, the coefficients are those of generated maps
-(`lab/benchmarks/place_prior.py`), which order the levels of any map, but are far too certain
-in a map of few photos. `thresholds` decides which level is the answer.
+A query is from elsewhere, or the map has its place. The log-odds of "elsewhere" are the prior's,
+plus a term for how similar the best photo is, in units of the scores of photos of different places
+(`Background`), and one for how far its place leads the other ranks, which show what photos of other
+places score for this query. What photos of elsewhere score was measured on foreign photos
+(`lab/benchmarks/place_prior.py`). Given that the map has the place, each level has a logistic
+regression on the features of the ranking (`level_features`). All probabilities come from these two
+and add up to one: a level's is that of "in this map" times its own, and a level that contains the
+whole map says that the query is in it.
+
+`fit` fits the levels to a map; without a fit, the coefficients are those of generated maps.
+`thresholds` decides which level is the answer.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -27,6 +34,9 @@ from shared.evaluation.places.evidence import (
     without_matches,
 )
 from shared.evaluation.places.levels import (
+    FEATURES,
+    MIN_SPREAD,
+    SUPPORT_UNIT,
     CandidateLevel,
     FloatArray,
     LevelScheme,
@@ -37,16 +47,113 @@ from shared.evaluation.places.levels import (
     ranking_spread,
     vote_weights,
 )
-from shared.evaluation.places.thresholds import CERTAINTIES, Thresholds
+from shared.evaluation.places.thresholds import CERTAINTIES
+from shared.geodesy import distance_m
+from shared.place_paths import label_levels
 
 CalibrationSource = Literal["prior", "own_photos", "labelled_queries"]
 
-OUT_OF_MAP_SHARE = 0.02
+OUT_OF_MAP_SHARE = 0.02  # of the frames of tracks, and of queries before a map is evaluated
+UNMAPPED_SHARE = 0.05  # of queries within the map's extent whose place has no photo
+ELSEWHERE_SHARE = 0.33  # of queries that are from elsewhere, unless the caller says otherwise
+DEFAULT_CERTAINTY = 0.95
 SMALL_MAP_PHOTOS = 200  # with fewer, the coefficients stay near the prior's
 PRIOR_FILE = Path(__file__).with_name("prior.json")
 
 Coefficients = tuple[float, ...]
 """Intercept, then one coefficient per standardised feature."""
+
+
+class Background(BaseModel):
+    """Mean and standard deviation of the scores of photos of a map with each other."""
+
+    model_config = ConfigDict(frozen=True)
+
+    mean: float
+    deviation: float
+
+    @classmethod
+    def of(cls, scores: Sequence[float]) -> Background:
+        """Return those of the scores of random pairs of photos."""
+        if not scores:
+            return cls(mean=0.0, deviation=1.0)
+        return cls(mean=float(np.mean(scores)), deviation=max(MIN_SPREAD, float(np.std(scores))))
+
+
+class Elsewhere(BaseModel):
+    """What photos of elsewhere score, as the log-odds that a query is one of them."""
+
+    model_config = ConfigDict(frozen=True)
+
+    coefficients: Coefficients
+    """intercept, with a prior of one half; of the similarity; of the votes"""
+    matched: Coefficients
+    """the same with matches, and of the logarithm of the largest match support"""
+    background: Background | None = None
+    """unit of the similarity; None: that of the map"""
+
+    def features(self, levels: Sequence[CandidateLevel]) -> FloatArray:
+        """Return the similarity of the best photo, the log-odds of the votes for its place, and,
+        with matches, the logarithm of 1 + the largest match support."""
+        assert self.background is not None
+        finest = levels[0].features
+        similarity = (levels[0].best_score - self.background.mean) / self.background.deviation
+        largest = SUPPORT_UNIT * finest[len(FEATURES) :][:2].max(initial=0.0)
+        described = np.array([similarity, finest[0], np.log1p(largest)])
+        return described if len(finest) > len(FEATURES) else described[:2]
+
+    def probability(self, levels: Sequence[CandidateLevel], share: float) -> float:
+        """Return the probability that a query is from elsewhere, with the prior `share`."""
+        features = self.features(levels)
+        intercept, *slopes = self.coefficients if len(features) == 2 else self.matched
+        log_odds = intercept + float(features @ np.array(slopes))
+        return float(sigmoid(np.array(log_odds + np.log(share / (1 - share)))))
+
+
+class MapExtent(BaseModel):
+    """The size of a map, or the label that all of its photos share."""
+
+    model_config = ConfigDict(frozen=True)
+
+    diameter_m: float | None = None
+    """distance that no two photos exceed; None without coordinates"""
+    place: str | None = None
+    """finest level of labels that all photos share"""
+
+    @classmethod
+    def of(cls, locations: Sequence[PhotoLocation], scheme: LevelScheme) -> MapExtent:
+        """Return the extent of photos with these locations."""
+        paths = [label_levels(spot.place, scheme.labels_are_paths) for spot in locations]
+        first = paths[0] if paths else []
+        shared = [place for place in first if all(place in path for path in paths)]
+        points = [
+            (spot.latitude, spot.longitude)
+            for spot in locations
+            if spot.latitude is not None and spot.longitude is not None
+        ]
+        diameter_m = None
+        if points:
+            south, west = np.min(points, axis=0).tolist()
+            north, east = np.max(points, axis=0).tolist()
+            diameter_m = distance_m(south, west, north, east)
+        return cls(diameter_m=diameter_m, place=shared[0] if shared else None)
+
+    def end_levels(self, levels: Sequence[CandidateLevel]) -> list[CandidateLevel]:
+        """Return the levels that are smaller than the map, and as the last one the whole map."""
+        finest_m, largest_m = levels[0].radius_m, levels[-1].radius_m
+        radius_m = finest_m and max(finest_m, self.diameter_m or largest_m or 0.0)
+        whole = replace(
+            levels[-1],
+            place=self.place if radius_m is None else None,
+            radius_m=radius_m,
+            is_whole_map=True,
+        )
+        labels = [level.place for level in levels]
+        if radius_m is not None:
+            smaller = [level for level in levels if (level.radius_m or 0.0) < radius_m]
+        else:
+            smaller = list(levels[: labels.index(self.place)] if self.place in labels else levels)
+        return [*smaller, whole]
 
 
 class PlacePrior(BaseModel):
@@ -57,8 +164,10 @@ class PlacePrior(BaseModel):
     means: tuple[float, ...]
     scales: tuple[float, ...]
     level: Coefficients
-    not_in_map: Coefficients
-    """log-odds if half of the queries are from outside the map"""
+    missing_place: Coefficients
+    """log-odds that the map has no photo of the place, if that holds for half of the queries"""
+    elsewhere: dict[str, Elsewhere] = {}
+    """by extractor, for maps with a vocabulary of their own; "" for all others"""
 
     def design(self, features: FloatArray) -> FloatArray:
         """Return the (n, 1 + F) design matrix of (n, F) features; those of matches stay as they
@@ -89,9 +198,10 @@ class PlaceEstimate:
     answer: int | None
     """index of the finest level that is certain enough"""
     not_in_map: float
-    """probability that the map has no photo of the place"""
+    """probability that the query is from elsewhere"""
     in_map: bool | None
-    """whether the map has a photo of the place; None if the model has no limit"""
+    """True if "in this map" is certain enough, False if "not in this map" is more probable, None
+    in between, and without a fit"""
     radius_68_m: float | None
     radius_95_m: float | None
     match_probabilities: Sequence[float]
@@ -111,11 +221,11 @@ class PlaceModel(BaseModel):
     """unit of score differences; None: that of each ranking"""
     levels: tuple[Coefficients, ...] = ()
     """by position, finest first; further levels have the prior's"""
-    not_in_map: Coefficients | None = None
-    thresholds: tuple[Thresholds, ...] = ()
-    """for each of CERTAINTIES"""
-    in_map_limit: float | None = None
-    """queries with a lower probability of "not in the map" show a place of the map"""
+    missing_place: Coefficients | None = None
+    elsewhere: Elsewhere | None = None
+    extent: MapExtent = MapExtent()
+    thresholds: tuple[float, ...] = ()
+    """least probability of an answer, for each of CERTAINTIES"""
     own_photos: int = 0
     labelled_queries: int = 0
     with_matches: PlaceModel | None = None
@@ -137,21 +247,27 @@ class PlaceModel(BaseModel):
         """Return this model, or the prior if the map's levels changed since it was fitted."""
         return self if self.scheme in (None, scheme) else PlaceModel()
 
-    def probabilities(self, levels: Sequence[CandidateLevel]) -> tuple[list[float], float]:
-        """Return the probability of each level, finest first, and that of "not in the map".
+    def probabilities(
+        self, levels: Sequence[CandidateLevel], elsewhere: float = ELSEWHERE_SHARE
+    ) -> tuple[list[float], float]:
+        """Return the probability of each level, finest first, and that of "not in this map".
 
-        A level contains the finer ones, so the probabilities are made not to decrease. The place
-        of the finest level cannot be right and missing: the two add up to 1 at most.
+        A level contains the finer ones, so the probabilities are made not to decrease.
+
+        Args:
+            levels: Those of `MapExtent.end_levels`.
+            elsewhere: Prior probability that a query is from elsewhere.
         """
         prior = shipped_prior()
+        missing = self.elsewhere.probability(levels, elsewhere) if self.elsewhere else elsewhere
         single = [
-            _probability(self.levels[i] if i < len(self.levels) else prior.level, level)
+            1.0
+            if level.is_whole_map
+            else _probability(self.levels[i] if i < len(self.levels) else prior.level, level)
             for i, level in enumerate(levels)
         ]
-        increasing = np.maximum.accumulate(np.array(single)).tolist()
-        shift = np.log(OUT_OF_MAP_SHARE / (1 - OUT_OF_MAP_SHARE))
-        missing = _probability(self.not_in_map or prior.not_in_map, levels[0], float(shift))
-        return increasing, min(missing, 1 - increasing[0])
+        increasing = (1 - missing) * np.maximum.accumulate(np.array(single))
+        return increasing.tolist(), missing
 
     def missing_log_odds(
         self,
@@ -160,7 +276,7 @@ class PlaceModel(BaseModel):
         scheme: LevelScheme,
         position_radius_m: float,
     ) -> float | None:
-        """Return the log-odds of "not in the map" if half of the queries are from outside it.
+        """Return the log-odds that the map lacks the place, if it does for half of the queries.
 
         Arguments are those of `estimate`. None without a fit, and for coordinates: in another
         season, all queries look as if they were not in the map.
@@ -170,24 +286,30 @@ class PlaceModel(BaseModel):
         levels = candidate_levels(ranking, near, scheme, unit, position_radius_m)
         if not self.is_fitted or not levels or levels[0].radius_m is not None:
             return None
-        return _log_odds(self.not_in_map or shipped_prior().not_in_map, levels[0])
+        return _log_odds(self.missing_place or shipped_prior().missing_place, levels[0])
+
+    def is_in_map(self, not_in_map: float, certainty: float = DEFAULT_CERTAINTY) -> bool | None:
+        """Return `PlaceEstimate.in_map`."""
+        if not self.is_fitted:
+            return None
+        if not_in_map <= 1 - certainty + 1e-9:
+            return True
+        return False if not_in_map > 0.5 else None
+
+    def accepts(self, levels: Sequence[CandidateLevel]) -> bool | None:
+        """Return `PlaceEstimate.in_map` of a query with these levels."""
+        return self.is_in_map(self.probabilities(self.extent.end_levels(levels))[1])
 
     def answer(
         self, probabilities: Sequence[float], not_in_map: float, certainty: float
     ) -> int | None:
         """Return the index of the finest level that is certain enough; None if none is."""
-        if not self.is_fitted:
+        if not self.is_in_map(not_in_map, certainty):
             return None
         stored = zip(CERTAINTIES, self.thresholds, strict=False)
-        thresholds = next((t for known, t in stored if known >= certainty - 1e-9), Thresholds())
-        return thresholds.answer(probabilities, not_in_map, certainty)
-
-    def accepts(self, levels: Sequence[CandidateLevel]) -> bool | None:
-        """Return whether a query with these levels shows a place of the map."""
-        return self._is_in_map(self.probabilities(levels)[1])
-
-    def _is_in_map(self, not_in_map: float) -> bool | None:
-        return None if self.in_map_limit is None else not_in_map < self.in_map_limit
+        least = next((t for known, t in stored if known >= certainty - 1e-9), certainty)
+        enough = (index for index, each in enumerate(probabilities) if each >= least)
+        return next(enough, None)
 
     def unit(self, ranking: Sequence[RankedPhoto]) -> float:
         """Return the unit of score differences for a ranking."""
@@ -201,6 +323,7 @@ class PlaceModel(BaseModel):
         certainty: float,
         position_radius_m: float,
         found: Sequence[RankedPhoto] | None = None,
+        elsewhere: float = ELSEWHERE_SHARE,
     ) -> PlaceEstimate | None:
         """Estimate the place of a query.
 
@@ -210,6 +333,7 @@ class PlaceModel(BaseModel):
             certainty: Share of the answers that must be right, above 0 and at most 1.
             position_radius_m: Photos within this distance of the best one determine the position.
             found: The ranking of a search with a filter; its photos determine the levels.
+            elsewhere: Prior probability that the query is from elsewhere.
 
         Returns:
             The estimate; None if the ranking has no location.
@@ -229,7 +353,8 @@ class PlaceModel(BaseModel):
         )
         if not levels:
             return None
-        probabilities, not_in_map = model.probabilities(levels)
+        levels = model.extent.end_levels(levels)
+        probabilities, not_in_map = model.probabilities(levels, elsewhere)
         ordered = order_by_matches(shown[:EVIDENCE_DEPTH], unit)
         return PlaceEstimate(
             model=model,
@@ -238,7 +363,7 @@ class PlaceModel(BaseModel):
             probabilities=probabilities,
             answer=model.answer(probabilities, not_in_map, certainty),
             not_in_map=not_in_map,
-            in_map=model._is_in_map(not_in_map),
+            in_map=model.is_in_map(not_in_map, certainty),
             radius_68_m=error_radius_m(levels, probabilities, 0.68),
             radius_95_m=error_radius_m(levels, probabilities, 0.95),
             match_probabilities=_match_probabilities(
@@ -288,8 +413,8 @@ def _match_probabilities(
     return matches
 
 
-def _probability(coefficients: Coefficients, level: CandidateLevel, shift: float = 0.0) -> float:
-    return float(sigmoid(np.array(_log_odds(coefficients, level) + shift)))
+def _probability(coefficients: Coefficients, level: CandidateLevel) -> float:
+    return float(sigmoid(np.array(_log_odds(coefficients, level))))
 
 
 def _log_odds(coefficients: Coefficients, level: CandidateLevel) -> float:

@@ -106,22 +106,17 @@ class OwnPhotoSampler:
     ) -> Iterator[PlaceSample]:
         """Yield the samples of photos: each as it is, and as an impostor of each kind.
 
-        The last kind stands for queries from far away, for which every level is wrong: they find
-        what an impostor finds. With `match`, the samples have the features of matches; those whose
+        With `match`, the samples have the features of matches; those whose
         first photos can't all be compared are left out.
         """
         for photo in photos:
             visible = self._visible(photo)
             is_alone = not (visible & self._at_place(photo)).any()
-            levels: list[CandidateLevel] = []
-            left_out = None
             for left_out, missing in self._kinds(photo):
                 levels = self._levels(photo, visible & ~missing, spread, match)
                 if levels:
                     right = [level.is_right(self._locations[photo]) for level in levels]
                     yield PlaceSample(photo, levels, right, left_out, is_alone)
-            if levels and left_out is not None:
-                yield PlaceSample(photo, levels, [False] * len(levels), "everything near")
 
     def neighbours(self, photo: int, visible: NDArray[np.bool_] | None = None) -> list[RankedPhoto]:
         """Return the ranking of a photo among the visible ones, by default all."""

@@ -43,7 +43,7 @@ def maps(catalog: Catalog) -> list[UUID]:
         return [add_map(session, name).id for name in ("a", "b")]
 
 
-def test_units_that_wait_for_each_other_both_come_to_their_end(
+def test_deadlocked_transactions_are_retried_until_both_commit(
     catalog: Catalog, maps: list[UUID]
 ) -> None:
     both = threading.Barrier(2)
@@ -90,7 +90,7 @@ def test_serialization_failure_is_run_again_until_it_succeeds(
     assert runs == 3
 
 
-def test_units_that_never_get_through_are_given_up(catalog: Catalog) -> None:
+def test_retries_of_a_transaction_are_limited(catalog: Catalog) -> None:
     runs = 0
 
     def unit(session: Session) -> None:

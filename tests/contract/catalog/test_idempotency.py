@@ -64,7 +64,7 @@ def test_a_stored_response_is_replayed_unchanged_to_its_scope_and_key(catalog: C
     assert claim(catalog) == ANSWER
 
 
-def test_a_call_under_way_is_not_begun_again(catalog: Catalog) -> None:
+def test_a_call_in_progress_is_not_started_again(catalog: Catalog) -> None:
     token(catalog)
     with pytest.raises(Conflict) as caught:
         claim(catalog)
@@ -87,7 +87,7 @@ def test_another_call_under_the_key_is_refused(
         assert claim(catalog) == ANSWER
 
 
-def test_a_dead_callers_key_is_taken_over_and_it_can_commit_no_more(catalog: Catalog) -> None:
+def test_an_expired_lease_is_taken_over_and_its_holder_can_not_commit(catalog: Catalog) -> None:
     dead = token(catalog, lease_seconds=-1)
     living = token(catalog)
     with pytest.raises(Conflict):
@@ -98,7 +98,7 @@ def test_a_dead_callers_key_is_taken_over_and_it_can_commit_no_more(catalog: Cat
     assert claim(catalog) == ANSWER
 
 
-def test_a_slow_caller_that_no_one_replaced_commits_and_may_replace_its_answer(
+def test_an_expired_lease_that_was_not_taken_over_can_commit(
     catalog: Catalog,
 ) -> None:
     held = token(catalog, lease_seconds=-1)
@@ -112,7 +112,7 @@ def test_a_slow_caller_that_no_one_replaced_commits_and_may_replace_its_answer(
     assert claim(catalog) == later, "what was answered is not given back"
 
 
-def test_a_key_that_was_given_back_is_free_at_once(catalog: Catalog) -> None:
+def test_a_released_key_is_free_at_once(catalog: Catalog) -> None:
     held = token(catalog)
     with catalog.write() as session:
         release_idempotency_key(session, held)
@@ -129,7 +129,7 @@ def test_an_expired_key_is_free_for_any_call(catalog: Catalog) -> None:
     assert rows(catalog) == 1
 
 
-def test_one_of_many_at_once_gets_the_key(catalog: Catalog) -> None:
+def test_one_of_concurrent_claims_gets_the_key(catalog: Catalog) -> None:
     together = threading.Barrier(8)
 
     def one(_: int) -> bool:

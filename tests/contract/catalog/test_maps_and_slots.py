@@ -21,7 +21,7 @@ from shared.catalog.maps import Map, get_or_create_default_map, increment_map_ve
 from shared.catalog.models import Model, get_or_create_model
 from shared.catalog.photos import (
     count_live_photos,
-    find_photo_by_sha256,
+    find_same_photo,
     get_live_photos,
     get_photo,
     list_photos_changed_since,
@@ -91,7 +91,7 @@ def test_a_deleted_photo_and_one_of_another_map_show_in_no_query(
             with pytest.raises(NotFound):
                 get_photo(session, map_id, hidden)
         assert list(get_live_photos(session, [stays, goes])) == [stays]
-        assert find_photo_by_sha256(session, map_id, "b" * 64) is None
+        assert find_same_photo(session, map_id, "b" * 64, None) is None
         assert count_live_photos(session, map_id) == 1
         page, total = search_photos(session, map_id, MetadataFilter(), 10, None)
         assert ([photo.id for photo in page], total) == ([stays], 1)

@@ -78,7 +78,7 @@ def test_sql_and_the_scan_let_pass_what_the_filter_means(catalog: Catalog, map_i
     agree()
 
 
-def test_coordinates_too_small_for_a_double_spoil_no_search(catalog: Catalog, map_id: UUID) -> None:
+def test_denormal_coordinates_fail_no_search(catalog: Catalog, map_id: UUID) -> None:
     """PostgreSQL raises where a square underflows: one such photo would end every search."""
     tiny = 5e-324
     with catalog.write() as session:

@@ -192,9 +192,7 @@ def test_the_cursor_pages_through_everything_exactly_once(catalog: Catalog, map_
         assert order == sorted(order, reverse=True)
 
 
-def test_a_photo_that_arrives_while_someone_pages_moves_no_other(
-    catalog: Catalog, map_id: UUID
-) -> None:
+def test_a_photo_inserted_between_two_pages_shifts_no_other(catalog: Catalog, map_id: UUID) -> None:
     with catalog.write() as session:
         ids = [add_photo(session, map_id, uploaded_at=MOMENT).id for _ in range(6)]
 

@@ -6,10 +6,15 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
+
+from sqlalchemy import MetaData, Row, select
+from sqlalchemy.schema import CreateTable
 
 from shared.catalog.database.base import Base
 from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
+from tests.support.catalog_rows import add_map
 
 ROOT = Path(__file__).parents[3]
 
@@ -32,5 +37,18 @@ def test_opening_the_catalog_registers_every_table() -> None:
     assert json.loads(opened.stdout) == sorted(Base.metadata.tables)
 
 
-def test_migrating_twice_changes_nothing(catalog: Catalog) -> None:
+def test_migrating_twice_changes_neither_tables_nor_rows(catalog: Catalog) -> None:
+    def read_all() -> dict[str, list[Row[Any]]]:
+        found = MetaData()
+        with catalog.read() as session:
+            found.reflect(session.connection())
+            return {
+                str(CreateTable(table)): list(session.execute(select(table)))
+                for table in found.sorted_tables
+            }
+
+    with catalog.write() as session:
+        add_map(session)
+    before = read_all()
     migrate(catalog)
+    assert read_all() == before

@@ -13,7 +13,7 @@ from shared.catalog.database.base import db_now, db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, active_generation
 from shared.catalog.maps import Map, increment_map_version
-from shared.catalog.photos import Photo, count_live_photos, find_photo_by_sha256
+from shared.catalog.photos import Photo, count_live_photos, find_same_photo
 from shared.ids import new_id
 from tests.support.catalog_rows import add_generation, add_map, add_photo, delete
 
@@ -75,7 +75,7 @@ def test_write_rolls_back_when_its_block_raises(catalog: Catalog, map_id: UUID) 
         assert count_live_photos(session, map_id) == 1
 
 
-def test_read_never_writes(catalog: Catalog, map_id: UUID) -> None:
+def test_a_read_session_refuses_writes(catalog: Catalog, map_id: UUID) -> None:
     with pytest.raises(DBAPIError, match=r"read-?only"), catalog.read() as session:
         add_photo(session, map_id)
     with catalog.read() as session:
@@ -111,7 +111,7 @@ def test_the_same_live_bytes_are_stored_once_in_a_map_and_again_after_deletion(
         with catalog.write() as session:
             first = add_photo(session, map_id, sha256="a" * 64).id
     with catalog.read() as session:
-        found = find_photo_by_sha256(session, map_id, "a" * 64)
+        found = find_same_photo(session, map_id, "a" * 64, None)
         assert found is not None
         assert found.id == first
 

@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import Job, JobState
 from shared.catalog.maps import Map, mark_map_deleted
-from shared.catalog.photos import Photo, find_photo_by_sha256
+from shared.catalog.photos import Photo, find_same_photo
 from shared.errors import NotFound
 from shared.imaging.photo_header import PhotoHeader
 from shared.ingest import store_photo as store_photo_module
@@ -33,10 +33,22 @@ def map_id(catalog: Catalog) -> UUID:
         return add_map(session, NAME).id
 
 
-def photo(number: int = 0, key: str = "originals/a") -> ValidatedPhoto:
+def photo(
+    number: int = 0,
+    key: str = "originals/a",
+    picture: str | None = None,
+    header: PhotoHeader | None = None,
+) -> ValidatedPhoto:
     received = StoredUpload(key, "a.jpg", 1000, f"{number:064x}", b"")
-    header = PhotoHeader(640, 480)
-    return ValidatedPhoto(received, "image/jpeg", header, PhotoFields(place="hall", tags=["day"]))
+    header = header or PhotoHeader(640, 480)
+    fields = PhotoFields(place="hall", tags=["day"])
+    return ValidatedPhoto(received, "image/jpeg", header, fields, picture_sha256=picture)
+
+
+def finish(catalog: Catalog, stored: StoreResult) -> None:
+    assert stored.job is not None
+    with catalog.write() as session:
+        session.get_one(Job, stored.job.id).state = JobState.SUCCEEDED
 
 
 def store(catalog: Catalog, incoming: ValidatedPhoto) -> StoreResult:
@@ -108,12 +120,46 @@ def test_a_photo_whose_twin_is_deleted_between_insert_and_lookup_is_stored(
     def delete_then_find(session: Session, *arguments: object) -> Photo | None:
         session.get_one(Photo, first.photo.id).deleted_at = first.photo.uploaded_at
         session.flush()
-        return find_photo_by_sha256(session, *arguments)  # type: ignore[arg-type]
+        return find_same_photo(session, *arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(store_photo_module, "find_photo_by_sha256", delete_then_find)
+    monkeypatch.setattr(store_photo_module, "find_same_photo", delete_then_find)
     second = store(catalog, photo())
     assert second.queued
     assert second.photo.id != first.photo.id
+
+
+LOCATED = PhotoHeader(640, 480, latitude=45.07, longitude=7.68)
+
+
+def test_a_file_of_the_same_picture_with_new_coordinates_updates_the_photo(
+    catalog: Catalog, map_id: UUID
+) -> None:
+    first = store(catalog, photo(1, "originals/1", "same"))
+    finish(catalog, first)
+    stripped = store(catalog, photo(3, "originals/3", "same"))
+    assert (stripped.photo.id, stripped.updated) == (first.photo.id, ())
+    assert stripped.unused_key == "originals/3", "a file with less metadata replaces nothing"
+    second = store(catalog, photo(2, "originals/2", "same", LOCATED))
+    assert (second.photo.id, second.already_there) == (first.photo.id, True)
+    assert (second.updated, second.unused_key) == (("latitude", "longitude"), "originals/1")
+    with catalog.read() as session:
+        [found] = session.scalars(select(Photo))
+        assert (found.latitude, found.object_key) == (45.07, "originals/2")
+        assert found.changed_version == session.get_one(Map, map_id).version
+    again = store(catalog, photo(2, "originals/4", "same", LOCATED))
+    assert (again.updated, again.unused_key) == ((), "originals/4")
+    assert not store(catalog, photo(5, "originals/5", "another", LOCATED)).already_there
+
+
+def test_the_file_of_a_photo_that_is_being_described_is_not_replaced(
+    catalog: Catalog, map_id: UUID
+) -> None:
+    store(catalog, photo(1, "originals/1", "same"))
+    second = store(catalog, photo(2, "originals/2", "same", LOCATED))
+    assert (second.updated, second.unused_key) == (("latitude", "longitude"), "originals/2")
+    with catalog.read() as session:
+        [found] = session.scalars(select(Photo))
+        assert (found.latitude, found.object_key) == (45.07, "originals/1")
 
 
 def test_a_map_that_does_not_exist_or_is_deleted_is_not_found(

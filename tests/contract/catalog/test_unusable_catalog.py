@@ -86,7 +86,7 @@ def make_folder(file: Path) -> None:
         (make_folder, "catalog_is_folder", "is a folder"),
     ],
 )
-def test_a_start_names_the_file_and_the_ways_out(
+def test_an_unusable_catalog_is_reported_with_its_file_and_remedies(
     file: Path, catalog: Catalog, damage: Callable[[Path], None], code: str, says: str
 ) -> None:
     damage(file)

@@ -47,4 +47,4 @@ def end(catalog: Catalog, jobs: list[Job]) -> list[UUID]:
 
 def free(catalog: Catalog, **options: Any) -> int:
     with catalog.write() as session:
-        return reclaim_expired_leases(session, **options)
+        return len(reclaim_expired_leases(session, **options))

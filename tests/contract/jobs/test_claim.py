@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from uuid import UUID
@@ -16,7 +17,7 @@ from shared.catalog.generations import GenerationState
 from shared.catalog.jobs import SINGLE_CLAIM_JOBS, Priority, WaitingFor, get_job, list_jobs
 from shared.errors import NotFound
 from shared.jobs import Job, JobKind, JobState
-from shared.jobs.claim import claim_jobs
+from shared.jobs.claim import claim_jobs, fair_batch_size
 from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.model_changes import (
     wake_vocabulary_waiters,
@@ -219,3 +220,21 @@ def test_jobs_of_a_map_are_listed_newest_first_and_filtered(catalog: Catalog, ma
         assert ids(list_jobs(session, map_id, [], [JobKind.REINDEX], 10, None)) == [reindex]
         with pytest.raises(NotFound):
             get_job(session, map_id, elsewhere)
+
+
+@pytest.mark.parametrize("waiting", [40, 80, 400])
+def test_workers_share_a_burst_that_one_of_them_sees_first(waiting: int) -> None:
+    """The first prefetches a batch, as extractors do, before the other comes."""
+    shares = [0, 0]
+    for worker in itertools.chain([0, 0], itertools.cycle([1, 0])):
+        taken = min(fair_batch_size(waiting, 2, 32), waiting)
+        shares[worker] += taken
+        waiting -= taken
+        if not waiting:
+            break
+    assert min(shares) > 0.3 * sum(shares)
+
+
+def test_a_single_worker_and_a_long_queue_have_full_batches() -> None:
+    assert fair_batch_size(5, 1, 32) == 32
+    assert fair_batch_size(1000, 2, 32) == 32

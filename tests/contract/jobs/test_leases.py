@@ -302,7 +302,7 @@ def test_a_job_is_blamed_for_a_crash_once_it_has_begun(catalog: Catalog, map_id:
     for _ in range(5):
         with catalog.write() as session:
             claim_jobs(session, worker="w", limit=1, lease_seconds=60, started=False)
-            assert reclaim_expired_leases(session, all_leases=True) == 1
+            assert len(reclaim_expired_leases(session, all_leases=True)) == 1
     job = read_job(catalog, job_id)
     assert (job.state, job.attempts, job.alone) == (JobState.QUEUED, 0, False)
     with catalog.write() as session:

@@ -12,7 +12,7 @@ import pytest
 
 from shared.catalog.database.session import Catalog
 from shared.catalog.photos import PhotoRole
-from shared.errors import Gone, InvalidRequest, Unavailable
+from shared.errors import Gone, Unavailable
 from shared.ids import new_id
 from shared.search_api.photo_filter import Box, Circle
 from shared.search_api.protocol import SearchBackend, SearchResponse
@@ -90,57 +90,6 @@ class SearchPortContract:
         bound = (expected[7][1] + expected[8][1]) / 2
         request = places.request(places.query(vector), k=30, min_score=bound)
         assert_answers(port().search(request), expected[:8])
-
-    @pytest.mark.parametrize("k", [1, 5, 30])
-    def test_word_weights_rank_and_the_score_stays_the_plain_cosine(
-        self, places: SmallMap, port: OpenPort, k: int
-    ) -> None:
-        """Weights 3, 0, 1, 0.5 of four words of three numbers; also with a least score, which is
-        of the plain cosine, and over equal rows."""
-        for slot in range(3):
-            places.add(np.repeat(unit_rows(slot, 5), 2, axis=0), slot=slot)
-        vector, weights = unit_rows(9, 1)[0], (3.0, 0.0, 1.0, 0.5)
-        product = vector.astype(np.float64) * np.repeat(weights, 3)
-        # A query like any other: float32.
-        weighted = (product / np.linalg.norm(product)).astype(np.float32).astype(np.float64)
-        weighted /= np.linalg.norm(weighted)
-        exact = vector.astype(np.float64) / np.linalg.norm(vector.astype(np.float64))
-        by_weight = sorted(
-            (
-                -float(row.astype(np.float64) @ weighted),
-                photo_id,
-                float(row.astype(np.float64) @ exact),
-            )
-            for photo_id, row in places.rows.items()
-        )
-        assert [hit[1] for hit in by_weight] != [hit[0] for hit in places.brute_force(vector, 30)]
-        search = port()
-        for least in (None, 0.0):
-            request = places.request(places.query(vector), k=k, min_score=least)
-            answer = search.search(request.model_copy(update={"word_weights": weights}))
-            expected = [hit for hit in by_weight if least is None or hit[2] >= least][:k]
-            assert len(answer.hits) == len(expected) > 0
-            assert [hit.photo_id for hit in answer.hits] == [hit[1] for hit in expected]
-            by = [hit.weighted_score for hit in answer.hits]
-            assert by == pytest.approx([-hit[0] for hit in expected], abs=2e-12)
-            plain = [hit.score for hit in answer.hits]
-            assert plain == pytest.approx([hit[2] for hit in expected], abs=2e-12)
-            assert answer.rows_scanned == 30
-
-    def test_query_without_any_weighted_word_is_ranked_plainly_and_unfit_weights_are_refused(
-        self, places: SmallMap, port: OpenPort
-    ) -> None:
-        places.add(unit_rows(1, 9))
-        vector = np.zeros(DIMENSION, dtype=np.float32)
-        vector[0] = 1.0
-        request = places.request(places.query(vector), k=9)
-        search = port()
-        answer = search.search(request.model_copy(update={"word_weights": (0.0, 1.0, 1.0, 1.0)}))
-        assert_answers(answer, places.brute_force(vector, 9))
-        assert {hit.weighted_score for hit in answer.hits} == {None}
-        with pytest.raises(InvalidRequest) as caught:
-            search.search(request.model_copy(update={"word_weights": (1.0,) * 5}))
-        assert caught.value.code == "word_weights_mismatch"
 
     def test_filtered_hits_are_the_best_of_what_passes(
         self, places: SmallMap, port: OpenPort

@@ -52,7 +52,9 @@ class AddDeleteMerge(RuleBasedStateMachine):
         self.catalog = Catalog(f"sqlite:///{self.folder / 'catalog.sqlite'}")
         self.store = FolderStore(self.folder / "objects")
         self.places = SmallMap(self.catalog, self.store)
-        self.worker = SearchWorker(self.catalog, self.store, Settings())
+        self.worker = SearchWorker(
+            self.catalog, self.store, Settings(), max_wait_seconds=60.0
+        )  # compiles kernels
 
     def teardown(self) -> None:
         if hasattr(self, "folder"):
@@ -84,7 +86,9 @@ class AddDeleteMerge(RuleBasedStateMachine):
 
     @rule()
     def forget_everything(self) -> None:
-        self.worker = SearchWorker(self.catalog, self.store, Settings())
+        self.worker = SearchWorker(
+            self.catalog, self.store, Settings(), max_wait_seconds=60.0
+        )  # compiles kernels
 
     @rule(which=st.integers(0, 1000))
     def remember_a_reference(self, which: int) -> None:

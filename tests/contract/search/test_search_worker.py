@@ -1,24 +1,23 @@
-"""The search worker keeps the contract with each method: dense, sign codes, GPU."""
+"""The search worker keeps the contract with each method: dense and sign codes."""
 
 from __future__ import annotations
 
 import os
+import threading
 from typing import Any, BinaryIO
 
 import numpy as np
 import pytest
-import torch
 
-from services.search import executor
 from services.search import worker as worker_module
-from services.search.catalog_sync import read_generation_versions
-from services.search.gpu import GpuRows
-from services.search.metrics import MeteredSearch
+from services.search.catalog_sync import read_generation_versions, sync_snapshot
+from services.search.snapshot import Snapshot
 from services.search.worker import SearchWorker
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, RowType
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD
+from shared.errors import Unavailable
 from shared.search_api.protocol import SearchBackend
 from shared.storage import FolderStore, read_retries
 from shared.storage.chunks import decode_rows
@@ -34,7 +33,8 @@ from tests.support.small_map import SmallMap, assert_answers, damaged, unit_rows
 @pytest.fixture
 def port(catalog: Catalog, store: FolderStore, settings: Settings) -> OpenPort:
     def open_port(**options: Any) -> SearchBackend:
-        return SearchWorker(catalog, store, settings, **options)
+        # The first query of a process may wait until kernels are compiled.
+        return SearchWorker(catalog, store, settings, **{"max_wait_seconds": 60.0, **options})
 
     return open_port
 
@@ -145,7 +145,7 @@ def test_what_another_thread_loads_while_the_worker_syncs_stays_loaded(
     always_by_codes(monkeypatch)  # with cached files
     places = SmallMap(catalog, store)
     places.add(unit_rows(1, 30))
-    worker = SearchWorker(catalog, store, settings)
+    worker = SearchWorker(catalog, store, settings, max_wait_seconds=60)  # the kernels compile
     others: list[SmallMap] = []
 
     def read_before_another_map_is_searched(catalog: Catalog) -> Any:
@@ -170,6 +170,34 @@ def test_what_another_thread_loads_while_the_worker_syncs_stays_loaded(
     worker.sync()
     assert worker.status().versions.keys() == {places.generation_id}
     assert [folder.name for folder in cached.iterdir()] == [str(places.generation_id)]
+
+
+@whatever_the_catalog
+def test_queries_wait_for_one_slow_load_no_longer_than_their_deadline(
+    catalog: Catalog, store: FolderStore, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places = SmallMap(catalog, store)
+    places.add(unit_rows(1, 5))
+    request = places.request(places.query(unit_rows(2, 1)[0]))
+    worker = SearchWorker(places.catalog, places.store, settings, max_wait_seconds=0.1)
+    goes_on, loads = threading.Event(), 0
+
+    def load_slowly(*arguments: Any) -> Snapshot | None:
+        nonlocal loads
+        loads += 1
+        goes_on.wait(60)
+        return sync_snapshot(*arguments)
+
+    monkeypatch.setattr(worker_module, "sync_snapshot", load_slowly)
+    for _ in range(3):
+        with pytest.raises(Unavailable) as refused:
+            worker.search(request)
+        assert refused.value.code == "search_behind"
+    assert loads == 1
+    goes_on.set()
+    worker.sync()
+    assert len(worker.search(request).hits) == 5
+    assert loads == 1, "what was loaded for the refused queries is used"
 
 
 @whatever_the_catalog
@@ -240,47 +268,3 @@ class TestSearchWorkerOfFloat16RowsByCodes(TestSearchWorkerOfFloat16Rows):
     @pytest.fixture(autouse=True)
     def by_codes(self, monkeypatch: pytest.MonkeyPatch) -> None:
         always_by_codes(monkeypatch)
-
-
-@whatever_the_catalog
-class TestSearchWorkerOnADevice(TestSearchWorker):
-    """The same promises where the rows lie on a device: PyTorch's CPU stands for a GPU."""
-
-    certificate = "exhaustive"
-
-    @pytest.fixture
-    def port(
-        self,
-        catalog: Catalog,
-        store: FolderStore,
-        settings: Settings,
-        monkeypatch: pytest.MonkeyPatch,
-    ) -> OpenPort:
-        monkeypatch.setattr(executor, "sign_codes_pay_off", lambda selected, k: selected > 0)
-
-        def open_port(**options: Any) -> SearchBackend:
-            rows = GpuRows(torch.device("cpu"))
-            worker = SearchWorker(catalog, store, settings, gpu=rows, **options)
-            worker.sync()
-            return worker
-
-        return open_port
-
-    def test_status_and_metrics_have_what_lies_on_the_device(
-        self, places: SmallMap, port: OpenPort
-    ) -> None:
-        places.add(unit_rows(1, 40))
-        search = port()
-        assert isinstance(search, SearchWorker)
-        (device,) = search.status().devices
-        assert device.name == "cpu"
-        assert list(device.generations) == [places.generation_id]
-        before = device.resident_bytes
-        text = MeteredSearch(search).render().decode()
-        assert f'placewise_search_device_resident_bytes{{device="cpu"}} {before:.1f}' in text
-        assert 'placewise_search_device_failed{device="cpu"} 0.0' in text
-        places.add(unit_rows(2, 40))
-        search.search(places.request(places.query(unit_rows(3, 1)[0])))
-        (device,) = search.status().devices
-        assert device.resident_bytes == 2 * before, "a new chunk is on the device at once"
-        assert device.failure is None

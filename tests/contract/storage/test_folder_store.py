@@ -89,7 +89,7 @@ class TestFolderStore(ObjectStoreContract):
             store.put(key, b"x")
         assert keys_of(store) == ["a/b"]
 
-    def test_leftovers_of_a_killed_writer_go_at_the_start_of_who_is_alone_in_the_folder(
+    def test_leftovers_of_a_killed_writer_are_removed_by_the_only_process_of_the_folder(
         self, store: FolderStore
     ) -> None:
         store.put("a", b"whole")

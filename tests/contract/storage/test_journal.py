@@ -185,9 +185,7 @@ def test_what_changes_while_a_segment_is_written_is_written_by_the_next_one(
     assert journaled(store)[photo_id].row["place"] == "newer"
 
 
-def test_many_segments_become_one_with_the_last_states(
-    catalog: Catalog, store: ObjectStore
-) -> None:
+def test_segments_are_merged_with_the_latest_states(catalog: Catalog, store: ObjectStore) -> None:
     _, photo_id = filled(catalog)
     write_snapshot(catalog, store, max_age_seconds=0)  # is not merged
     for number in range(9):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from datetime import UTC, date, datetime, timedelta
 from typing import Any
 
@@ -15,7 +15,7 @@ from shared.errors import NotFound, StorageFull
 from shared.storage import FolderStore, ObjectStore, OwnedStore
 from shared.storage.keys import OWNER_MARK, trash_key
 from shared.storage.s3 import S3Store
-from tests.support.servers import S3Server, start_moto
+from tests.support.servers import S3Server
 
 MEGABYTE = 1_000_000
 
@@ -27,7 +27,7 @@ def keys_of(store: ObjectStore, prefix: str = "") -> list[str]:
 class ObjectStoreContract:
     """Every promise of the port. A store's test class gives it a fixture named `store`."""
 
-    def test_what_is_put_is_what_is_got(self, store: ObjectStore) -> None:
+    def test_get_returns_the_bytes_of_put(self, store: ObjectStore) -> None:
         for key, data in {"a": b"one", "a-folder/b": bytes(range(256)), "empty": b""}.items():
             store.put(key, data)
             assert store.get(key) == data
@@ -56,7 +56,7 @@ class ObjectStoreContract:
         for begin, count in ((0, 10), (500_000, 1), (size - 10, 10), (0, MEGABYTE), (7, 300_000)):
             assert store.read_range("chunks/large", begin, count) == data[begin : begin + count]
 
-    def test_range_that_reaches_behind_the_end_is_short(self, store: ObjectStore) -> None:
+    def test_range_beyond_the_end_is_truncated(self, store: ObjectStore) -> None:
         store.put("short", b"12345")
         for begin, size in ((4, 100), (5, 1), (6, 1), (1000, 10), (2, 0)):
             assert store.read_range("short", begin, size) == b"12345"[begin : begin + size]
@@ -81,9 +81,7 @@ class ObjectStoreContract:
         writer.commit()
         assert keys_of(store) == ["originals/a"]
 
-    def test_old_object_stands_until_the_new_one_replaces_it_whole(
-        self, store: ObjectStore
-    ) -> None:
+    def test_object_is_replaced_at_commit(self, store: ObjectStore) -> None:
         store.put("a", b"a long first version")
         writer = store.writer("a")
         writer.write(b"short")
@@ -93,7 +91,7 @@ class ObjectStoreContract:
         assert keys_of(store) == ["a"]
 
     @pytest.mark.parametrize("size", [4, 12 * MEGABYTE])
-    def test_abort_leaves_what_was_there(self, store: ObjectStore, size: int) -> None:
+    def test_abort_keeps_the_previous_object(self, store: ObjectStore, size: int) -> None:
         store.put("a", b"old")
         for key in ("a", "b"):
             writer = store.writer(key)
@@ -162,9 +160,7 @@ class ObjectStoreContract:
         assert caught.value.code == "object_not_found"
         assert store.head("not/there") is None
 
-    def test_keys_that_begin_or_continue_another_one_do_not_touch_it(
-        self, store: ObjectStore
-    ) -> None:
+    def test_keys_that_are_prefixes_of_others_are_independent(self, store: ObjectStore) -> None:
         """A store may reject them, or store them beside it."""
         store.put("a/b/c", b"there before")
         for key in ("a", "a/b", "a/b/c/d"):
@@ -210,7 +206,7 @@ class ObjectStoreContract:
             assert info.size_bytes == len(info.key)
             assert info == store.head(info.key)
 
-    def test_objects_may_go_while_they_are_listed(self, store: ObjectStore) -> None:
+    def test_objects_may_be_deleted_while_they_are_listed(self, store: ObjectStore) -> None:
         for number in range(20):
             store.put(f"a/{number:02}", b"x")
         seen = []
@@ -251,7 +247,7 @@ class ObjectStoreContract:
         store.put("a/b", b"lower")
         assert (store.get("a/B"), store.get("a/b")) == (b"upper", b"lower")
 
-    def test_check_is_silent_when_all_is_well_and_leaves_nothing(self, store: ObjectStore) -> None:
+    def test_check_of_a_working_store_leaves_no_object(self, store: ObjectStore) -> None:
         store.check()
         assert keys_of(store) == []
 
@@ -290,7 +286,7 @@ class ObjectStoreContract:
         assert store.get("originals/a") == b"bytes"
 
     @pytest.mark.parametrize("key", ["originals/none", "chunks"])
-    def test_what_is_no_object_can_not_be_moved(self, store: OwnedStore, key: str) -> None:
+    def test_missing_object_can_not_be_moved(self, store: OwnedStore, key: str) -> None:
         store.put("chunks/a", b"bytes")
         with pytest.raises(NotFound):
             store.move(key, "trash/2026-11-22/a")
@@ -359,12 +355,6 @@ class TestS3Store(ObjectStoreContract):
                     store.put(f"originals/{name}", bytes(size))
             assert keys_of(store, "trash/") == []
             assert store.head(f"originals/{name}") is not None
-
-
-@pytest.fixture(scope="module")
-def moto() -> Iterator[S3Server]:
-    with start_moto() as server:
-        yield server
 
 
 class TestS3StoreOnMoto(ObjectStoreContract):

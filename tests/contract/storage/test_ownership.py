@@ -74,7 +74,7 @@ def copied(source: Bucket, target: Bucket) -> None:
         S3Store(target).put(info.key, S3Store(source).get(info.key))
 
 
-def test_an_installation_has_one_id_for_ever_and_no_other_has_it(
+def test_an_installation_has_a_permanent_and_unique_id(
     catalog: Catalog, other_catalog: Catalog
 ) -> None:
     ids = set()
@@ -85,7 +85,7 @@ def test_an_installation_has_one_id_for_ever_and_no_other_has_it(
     assert len(ids) == 2
 
 
-def test_empty_bucket_is_taken_and_taken_again_at_the_next_start(
+def test_an_empty_bucket_is_claimed_and_opened_again(
     started: Started, catalog: Catalog, bucket: Bucket
 ) -> None:
     started(catalog, bucket).put("originals/a", b"x")
@@ -109,7 +109,7 @@ def test_services_that_start_together_agree_on_the_bucket(
     assert len(opened) == 4
 
 
-def test_bucket_with_other_things_in_it_is_refused_and_left_alone(
+def test_a_bucket_with_foreign_objects_is_refused_and_unchanged(
     started: Started, catalog: Catalog, bucket: Bucket
 ) -> None:
     S3Store(bucket).put("thumbnails/theirs", b"x")
@@ -196,7 +196,7 @@ def photo_of_before(catalog: Catalog, settings: Settings) -> OwnedStore:
     return store
 
 
-def test_store_of_another_catalog_is_refused_and_the_ways_out_are_named(
+def test_a_store_of_another_catalog_is_refused_with_the_remedies(
     used: Settings, catalog: Catalog, other_catalog: Catalog
 ) -> None:
     open_installation_store(catalog, used, exclusive=False).put("originals/a", b"x")

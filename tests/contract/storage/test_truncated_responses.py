@@ -10,7 +10,6 @@ from lab.benchmarks.fault_injection import FaultProxy, ProxyMode
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
 from shared.storage.s3 import Bucket, S3Store
-from tests.support.servers import start_moto
 from tests.support.servers.daemon import free_ports
 from tests.support.servers.s3 import S3Server
 
@@ -36,28 +35,22 @@ CALLS: dict[str, tuple[Callable[[S3Store], object], int]] = {
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[S3Server]:
-    with start_moto() as server:
-        yield server
-
-
-@pytest.fixture(scope="module")
-def proxy(server: S3Server) -> Iterator[FaultProxy]:
-    with FaultProxy(free_ports(1)[0], int(server.endpoint.rpartition(":")[2])) as proxy:
+def proxy(moto: S3Server) -> Iterator[FaultProxy]:
+    with FaultProxy(free_ports(1)[0], int(moto.endpoint.rpartition(":")[2])) as proxy:
         yield proxy
 
 
 @pytest.mark.parametrize(("call", "body_bytes"), CALLS.values(), ids=CALLS.keys())
 def test_answer_whose_body_is_cut_is_no_answer(
-    server: S3Server, proxy: FaultProxy, call: Callable[[S3Store], object], body_bytes: int
+    moto: S3Server, proxy: FaultProxy, call: Callable[[S3Store], object], body_bytes: int
 ) -> None:
     """Within the head no other error comes than that of a store that can't be used."""
-    bucket = server.new_bucket()
+    bucket = moto.new_bucket()
     S3Store(bucket).put(KEY, BODY)
     right = call(S3Store(bucket))
     codes: list[str | None] = []
     came = 0
-    variables = server.variables(bucket.name) | {"s3_endpoint": f"127.0.0.1:{proxy.port}"}
+    variables = moto.variables(bucket.name) | {"s3_endpoint": f"127.0.0.1:{proxy.port}"}
     settings = Settings(**variables)
     for place in range(0, LONGEST_BYTES, STEP_BYTES):
         with proxy.in_mode(ProxyMode.CUT_ANSWER, cut_after_bytes=place):

@@ -22,6 +22,7 @@ from tests.support.servers import (
     RedisServer,
     S3Server,
     postgres,
+    programs,
     redis,
     s3,
     start_postgres,
@@ -85,8 +86,6 @@ def test_without_any_server_the_test_fails_and_says_how_to_get_one(
 def test_the_packages_programs_are_found_where_the_machine_has_none(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, package: str
 ) -> None:
-    from tests.support.servers import programs
-
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(programs, "DEBIAN", tmp_path)
     find = {
@@ -100,13 +99,17 @@ def test_the_packages_programs_are_found_where_the_machine_has_none(
     assert os.access(found, os.X_OK)
 
 
-def test_the_packages_postgres_runs_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from tests.support.servers import programs
-
-    path = os.environ["PATH"].split(":")
-    here = [folder for folder in path if not Path(folder, "postgres").exists()]
-    monkeypatch.setenv("PATH", ":".join(here))
-    monkeypatch.setattr(programs, "DEBIAN", tmp_path)
+@pytest.mark.parametrize("private", [False, True])
+def test_the_packages_postgres_runs_below_a_folder_that_others_may_enter_or_not(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, private: bool
+) -> None:
+    [program] = programs.in_package(*programs.POSTGRES_PACKAGE)
+    package = program.parents[2]
+    if private:  # as pytest's folders are
+        for part in (package.name, f"{package.name}.libs"):
+            (tmp_path / part).symlink_to(package.with_name(part))
+        program = tmp_path / program.relative_to(package.parent)
+    monkeypatch.setattr(postgres, "find_postgres", lambda: program)
     monkeypatch.delenv(postgres.VARIABLE, raising=False)
     monkeypatch.setattr(postgres, "engine_answers", lambda: False)
     with start_postgres() as server:

@@ -93,7 +93,7 @@ class Builder:
                         variables.pop(other, None)
                 case "ARG":
                     argument, _, default = value.partition("=")
-                    variables[argument] = given.get(argument, default)
+                    variables[argument] = given.get(argument, default.strip('"'))
                 case "WORKDIR":
                     folder = root / value.lstrip("/")
                     folder.mkdir(parents=True)

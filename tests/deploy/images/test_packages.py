@@ -59,8 +59,11 @@ def test_an_image_holds_what_its_service_and_the_command_import(
     run_python(image(service), tmp_path, IMPORT, *MODULES[service], *command)
 
 
-def test_only_the_images_that_describe_photos_hold_torch(image: BuildImage) -> None:
-    holding = {service for service in MODULES if "torch" in image(service).packages()}
+@pytest.mark.parametrize("package", ["torch", "pillow-heif"])
+def test_only_the_images_that_describe_photos_hold_what_decodes_and_describes(
+    package: str, image: BuildImage
+) -> None:
+    holding = {service for service in MODULES if package in image(service).packages()}
     assert holding == {"embedded", "extractor"}
 
 

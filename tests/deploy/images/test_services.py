@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -16,7 +15,7 @@ from redis import Redis
 from redis.exceptions import RedisError
 from sqlalchemy.engine import URL
 
-from shared.jobs.celery_wakeups import DRAIN_TASK
+from shared.jobs.wakeups import WakeupQueue
 from tests.deploy.composition import EMBEDDED, SERVICES, make_env, services, variables
 from tests.deploy.images.conftest import BuildImage
 from tests.deploy.images.machine import Machine
@@ -160,7 +159,7 @@ def test_photo_is_described_and_found_in_both_shards(api: Caller) -> None:
     assert (answer["vocabulary"], answer["missing"]) == ("foreign", [])
 
 
-def test_flower_shows_the_extractors_and_what_a_drain_did(
+def test_flower_shows_the_extractors_and_the_photos(
     machine: Machine, api: Caller, values: dict[str, str]
 ) -> None:
     key = ("flower", values["FLOWER_PASSWORD"])
@@ -169,22 +168,20 @@ def test_flower_shows_the_extractors_and_what_a_drain_did(
         def workers() -> Any:
             return flower.get("/workers", params={"json": "1"}).json()["data"]
 
-        # Drains of before Flower knew the extractors need not be there.
         api.until(lambda: len(workers()) == 2)
-        api.succeeded(api.upload(PHOTOS))
+        job = api.upload(PHOTOS)
+        api.succeeded(job)
 
-        def drains() -> list[Json]:
-            tasks = flower.get("/api/tasks").json().values()
-            done = [task for task in tasks if task["state"] == "SUCCESS"]
-            assert {task["name"] for task in done} <= {DRAIN_TASK}
-            return [read for task in done if (read := ast.literal_eval(task["result"]))["claimed"]]
+        def task() -> Json | None:
+            shown = flower.get("/api/tasks").json().get(job)
+            return shown if shown and shown["state"] == "SUCCESS" else None
 
-        result = api.until(drains)[-1]
-        assert set(result) == {"maps", "claimed", "succeeded", "failed", "seconds"}
-        assert result["succeeded"] == result["claimed"] > 0
-        assert {"decode", "describe", "publish"} <= set(result["seconds"])
+        shown = api.until(task)
+        assert shown["name"] == "placewise.index"
+        assert f"{PHOTOS}.jpg" in shown["kwargs"]
+        queues = flower.get("/api/queues/length").json()["active_queues"]
+        assert {queue["name"] for queue in queues} == set(WakeupQueue)
 
-        # Between two drains they answer within Flower's one second, on a busy machine not at once.
         names = {worker["hostname"] for worker in workers()}
         api.until(lambda: set(flower.get("/api/workers", params={"refresh": "1"}).json()) == names)
         # What Flower shows can't be changed by it.

@@ -24,7 +24,6 @@ from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import get_map
 from shared.catalog.models import Model, remove_model
-from shared.catalog.vocabularies import word_weights_unavailable_reason
 from shared.descriptors.backbones import normalise_pixels
 from shared.descriptors.backbones.torchhub import module_fingerprint
 from shared.imaging.decode import decode_photo
@@ -53,9 +52,6 @@ from tests.support.exported import (
 )
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
-
-# tests/e2e/test_serve_models.py does the same on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
 
 PHOTOS = 3
 
@@ -549,10 +545,6 @@ def test_two_extractors_side_by_side_describe_a_map_with_one_vocabulary(
     assert found["similar_images"][0]["image_id"] != ids[1]
     used = problem(allowing("DELETE", "/models/tiny"), 409, "model_in_use")
     assert used["maps"] == ["both"]
-    with allowing.catalog.read() as session:
-        reason = word_weights_unavailable_reason(session, generation)
-    assert reason is not None
-    assert "side by side" in reason
     shorter = switch(allowing, "both", pca=4)
     assert done(allowing, shorter, "both")["pca"]["from_dimension"] == 16 * words + DIMENSION
     again = allowing.json("POST", f"/similarity/{ids[1]}", params={"map": "both", "top_k": 1})

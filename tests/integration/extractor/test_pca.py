@@ -33,8 +33,7 @@ from tests.support.catalog_rows import failure_code
 from tests.support.checkpoints import none_added
 from tests.support.photos import photo_bytes
 
-# tests/e2e/test_vocabulary_command.py does the same on SQLite.
-pytestmark = [pytest.mark.databases("postgresql"), pytest.mark.numerics]
+pytestmark = pytest.mark.numerics
 
 PHOTOS = 14
 KEPT = 5

@@ -20,9 +20,6 @@ from tests.integration.workplace import Workplace, expected_row, same
 from tests.support.catalog_rows import problem_of, set_columns
 from tests.support.photos import photo_bytes
 
-# tests/faults/test_kills.py kills extractors on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 WAIT_SECONDS = 90.0
 BATCH = 4  # tests.integration.conftest
 
@@ -82,11 +79,8 @@ def test_next_batch_is_described_while_one_is_published_and_the_one_after_waits(
     draining.join()
     assert gate.seen.index("published 4") == 2
     assert sorted(gate.seen) == ["describe 4"] * 3 + ["published 4"] * 3
-    (result,) = results
-    assert (result.claimed, result.succeeded, result.failed) == (12, 12, 0)
-    assert list(result.seconds) == [
-        *("read", "decode", "thumbnails", "describe", "features", "publish")
-    ]
+    assert results == [True]
+    assert averages.ended() == (12, 0)
     rows = averages.rows()
     for number, photo_id in enumerate(photo_ids):
         assert same(rows[photo_id], expected_row("test-tiny-avg", photo_bytes(number)))
@@ -112,7 +106,8 @@ def test_leases_of_batches_that_wait_to_be_published_are_extended(
         time.sleep(0.1)
     gate.open.set()
     draining.join()
-    assert results[0].succeeded == 2 * BATCH
+    assert results == [True]
+    assert averages.ended() == (2 * BATCH, 0)
 
 
 def test_query_is_published_at_once_while_bulk_batches_wait_to_be(
@@ -158,8 +153,8 @@ def test_stopping_worker_publishes_what_it_has_described_and_gives_back_the_rest
     stop.set()
     gate.open.set()
     draining.join()
-    (result,) = results
-    assert (result.claimed, result.succeeded, result.interrupted) == (12, 8, True)
+    assert results == [True]
+    assert averages.ended() == (8, 0)
     assert set(averages.rows()) == set(photo_ids[:8])
     left = [averages.job_of(photo_id) for photo_id in photo_ids[8:]]
     assert all(job.state == JobState.QUEUED and job.lease_token is None for job in left)
@@ -197,8 +192,8 @@ def test_an_object_store_outage_during_publishing_costs_no_attempt(
         return real(store, key, *more)
 
     monkeypatch.setattr(FolderStore, "writer", away)
-    result = averages.drain()
-    assert (result.claimed, result.succeeded, result.failed) == (8, 4, 0)
+    averages.drain()
+    assert averages.ended() == (4, 0)
     paused = [averages.job_of(photo_id) for photo_id in photo_ids[:BATCH]]
     assert all((job.state, job.attempts) == (JobState.QUEUED, 0) for job in paused)
     assert set(averages.rows()) == set(photo_ids[BATCH:])
@@ -209,8 +204,8 @@ def test_photo_that_the_gpu_can_not_hold_fails_alone_and_is_not_tried_again(
 ) -> None:
     make_too_heavy(monkeypatch, 7)
     photo_ids = averages.upload(1, 7, 2)
-    result = averages.drain()
-    assert (result.claimed, result.succeeded, result.failed) == (3, 2, 1)
+    averages.drain()
+    assert averages.ended() == (2, 1)
     refused = averages.job_of(photo_ids[1])
     assert (refused.state, refused.attempts) == (JobState.FAILED, 0)
     assert problem_of(refused)["code"] == "gpu_out_of_memory"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from uuid import UUID
@@ -23,9 +24,6 @@ from tests.integration.workplace import Workplace, expected_row, same
 from tests.support.catalog_rows import set_columns
 from tests.support.photos import photo_bytes
 from tests.support.vit import random_weights, save
-
-# tests/e2e/test_readme.py starts with a pooled map on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
 
 VLAD = "test-tiny-vlad"
 POOLED = "test-tiny-vlad:aggregator=gem"
@@ -132,7 +130,7 @@ def test_photos_that_waited_for_a_vocabulary_are_described_once_a_worker_starts(
     set_columns(vlads.catalog, vlads.job_of(photo_id).id, waiting_for=WaitingFor.VOCABULARY)
     vlads.drain()
     assert vlads.job_of(photo_id).state == JobState.QUEUED
-    make_worker().warm_up()
+    make_worker().warm_up(threading.Event())
     vlads.drain()
     assert vlads.searchable() == 1
 

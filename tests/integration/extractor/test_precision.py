@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any
 from uuid import UUID
 
-import pytest
 import torch
 
 from services.extractor.generation_resolver import reindex_outdated_generations
@@ -20,9 +19,6 @@ from shared.jobs import JobKind, JobState
 from tests.integration.workplace import Workplace, same
 from tests.support.catalog_rows import problem_of
 from tests.support.photos import photo_bytes
-
-# tests/e2e/test_model_changes.py changes models on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
 
 
 def row(precision: Precision, number: int) -> Any:

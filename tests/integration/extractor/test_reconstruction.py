@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from sqlalchemy import select
 
+from services.extractor.geometry.job import ReconstructionJob
 from services.extractor.worker import ExtractorWorker
 from shared.catalog.jobs import Job, JobKind, JobState
 from shared.catalog.maps import Map
@@ -275,9 +276,23 @@ def test_interrupted_job_continues_after_its_last_stored_step(
 
 
 def test_components_are_not_made_again_by_a_job_that_has_stored_them(
-    walk: Walk, service: Service
+    walk: Walk, service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = walk.reconstruct()
+    attempts: list[int] = []
+
+    def look(self: ReconstructionJob, *arguments: Any) -> Any:
+        with service.catalog.write() as session:
+            attempts.append(session.get_one(Job, self._job.id).attempts)
+        return calibrate(self, *arguments)
+
+    calibrate = ReconstructionJob._finish
+    monkeypatch.setattr(ReconstructionJob, "_finish", look)
+    job_id = walk.start()
+    with service.catalog.write() as session:
+        session.get_one(Job, job_id).attempts = 2
+    walk.run()
+    assert attempts == [0], "workers that died in the steps before do not count"
+    made = walk.current()
     mapped_at = walk.written(component_key(made.id, 0))
     with service.catalog.write() as session:  # as if it had been killed while it aligned them
         row, job = session.get_one(Reconstruction, made.id), session.get_one(Job, made.job_id)

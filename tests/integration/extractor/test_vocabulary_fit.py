@@ -44,8 +44,7 @@ from tests.integration.workplace import FIT, Workplace, expected_row, same
 from tests.support.catalog_rows import failure_code, problem_of
 from tests.support.photos import photo_bytes
 
-# tests/e2e/test_model_changes.py fits vocabularies on SQLite.
-pytestmark = [pytest.mark.databases("postgresql"), pytest.mark.numerics]
+pytestmark = pytest.mark.numerics
 
 
 def test_a_fit_replaces_the_generation_while_the_old_one_answers(fitted: Workplace) -> None:

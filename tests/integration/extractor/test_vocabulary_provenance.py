@@ -19,9 +19,6 @@ from tests.integration.extractor.model_changes import WIDTH, import_file
 from tests.integration.workplace import Workplace
 from tests.support.catalog_rows import failure_code, problem_of
 
-# tests/e2e/test_vocabulary_command.py exports and imports vocabularies on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 
 def tiny_features() -> Provenance:
     config = get_extractor_config("test-tiny-vlad", allow_test_extractors=True)

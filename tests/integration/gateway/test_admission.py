@@ -36,9 +36,6 @@ from tests.support.catalog_rows import add_job, add_map
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
 
-# tests/e2e/test_backpressure.py fills a queue on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 GIGABYTE = 1_000_000_000
 Make = Callable[..., Service]
 
@@ -117,7 +114,7 @@ def test_all_maps_together_have_a_limit_and_queries_pass_it(
         assert service.ask(near_copy(number))
 
 
-def test_queries_have_a_limit_of_their_own_and_uploads_pass_it(make_service: Make) -> None:
+def test_a_full_queue_of_queries_refuses_no_upload(make_service: Make) -> None:
     service = make_service(max_queued_jobs=2)
     for number in range(10):
         service.ask(near_copy(number))
@@ -209,16 +206,16 @@ def test_throughput_is_that_of_uploads_and_queries_finished_in_the_last_minute(
         (1000, 0.0, UNKNOWN_RATE_RETRY_SECONDS),  # no job has finished
     ],
 )
-def test_the_time_to_come_again_follows_from_the_queue_and_its_speed(
+def test_retry_after_follows_from_queue_length_and_throughput(
     waiting: int, per_second: float, seconds: int
 ) -> None:
-    depth = QueueDepth({}, 0, finished_per_second=per_second)
+    depth = QueueDepth({}, 0, finished=round(60 * per_second))
     with pytest.raises(TooManyRequests) as caught:
         admission._check_queue("jobs", waiting, 1000, depth)
     assert caught.value.extra["retry_after_seconds"] == seconds
 
 
-def test_a_full_disk_takes_no_photo_and_answers_all_else(
+def test_a_full_disk_refuses_uploads_alone(
     make_service: Make, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service = make_service(min_free_bytes=GIGABYTE)
@@ -274,7 +271,7 @@ def test_the_disk_of_the_originals_counts_too_and_no_disk_where_nothing_lies(
     assert looked_at == []
 
 
-def test_one_gateway_receives_so_many_files_at_once(catalog: Catalog, settings: Settings) -> None:
+def test_concurrent_uploads_of_a_gateway_are_limited(catalog: Catalog, settings: Settings) -> None:
     room = AdmissionControl(catalog, settings.model_copy(update={"max_concurrent_uploads": 2}))
     ours, theirs, third = (call_of(new_id(), f"192.0.2.{host}") for host in (1, 2, 3))
     with room.admit_upload(UploadKind.UPLOAD, ours), room.admit_upload(UploadKind.UPLOAD, theirs):
@@ -293,7 +290,7 @@ def call_of(key_id: UUID | None, address: str) -> Request:
     return Request({"type": "http", "client": (address, 1), "state": {"caller": caller}})
 
 
-def test_one_key_and_one_address_leave_places_to_others(
+def test_concurrent_uploads_of_a_key_and_of_an_address_are_limited(
     catalog: Catalog, settings: Settings
 ) -> None:
     room = AdmissionControl(catalog, settings.model_copy(update={"max_concurrent_uploads": 4}))
@@ -334,7 +331,7 @@ def test_an_event_stream_too_many_is_refused_and_one_that_ended_makes_room(
 
 
 @pytest.mark.usefixtures("always_look")
-def test_health_says_how_full_things_are(
+def test_health_reports_the_use_of_queues_and_disks(
     make_service: Make, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     receiving = {UploadKind.UPLOAD: 3, UploadKind.QUERY: 2}

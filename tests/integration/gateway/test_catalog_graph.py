@@ -62,7 +62,8 @@ def ids_of(table: PhotoTable) -> set[str]:
     return set(ids)
 
 
-def test_the_catalog_answers_as_arrays_do(catalog: Catalog, map_id: UUID) -> None:
+@pytest.mark.databases("sqlite", "postgresql")
+def test_the_graph_of_the_catalog_equals_that_of_arrays(catalog: Catalog, map_id: UUID) -> None:
     with catalog.read() as session:
         graph = CatalogPhotoGraph(session, map_id)
         assert graph.photo_count == 180
@@ -175,6 +176,7 @@ def test_the_size_of_a_step_does_not_depend_on_the_number_of_photos_at_a_start_o
     assert most_near < max(sizes) <= most_photos + len(hits) + 2 * most_near
 
 
+@pytest.mark.databases("sqlite", "postgresql")
 def test_the_photos_of_a_map_that_is_no_longer_large_are_counted_again(
     catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:

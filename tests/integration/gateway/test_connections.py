@@ -221,7 +221,7 @@ def test_a_body_that_comes_too_slowly_is_answered_408_and_no_error_is_logged(
     assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
 
 
-def test_a_client_is_not_blamed_for_a_server_that_does_not_read() -> None:
+def test_the_time_limit_of_a_body_excludes_waits_for_the_server() -> None:
     with (
         serving(body_bytes_per_second=1_000_000, body_window_seconds=0.5) as server,
         server.connect() as client,
@@ -329,7 +329,7 @@ def test_a_trusted_proxy_is_unlimited_on_a_server_for_ipv4_and_ipv6(
     assert limits.of_address(address) == limit
 
 
-def test_the_limit_in_all_holds_while_many_connect_at_once() -> None:
+def test_the_total_limit_holds_under_concurrent_connects() -> None:
     with serving(total=30, per_address=0) as server, contextlib.ExitStack() as held:
         clients = [held.enter_context(server.connect()) for _ in range(300)]
         server.wait_for(lambda: server.connections.closed[Reason.TOTAL_LIMIT] == 270)

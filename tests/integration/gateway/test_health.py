@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 from uuid import UUID
 
 import pytest
+from sqlalchemy import update
 
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.maps import get_map
 from shared.catalog.processes import RegisteredProcess, process_heartbeat
+from shared.jobs import Job
 from shared.storage.trash import Hold, HoldReason, end_hold, write_hold
 from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import add_map, set_columns
 from tests.support.photos import photo_bytes
-
-# tests/e2e/test_legacy_settings.py reads the health of a Placewise on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
 
 ANYLOC = "anyloc-vits14:clusters=2,layer=0"
 
@@ -121,6 +121,36 @@ def test_photos_whose_description_failed_are_counted_and_listed(service: Service
     assert extractors(service, 200)["failed_photos"] == {}
 
 
+def test_health_says_that_redis_takes_no_messages(service: Service) -> None:
+    part = service.json("GET", "/health")["parts"]["queue"]
+    assert (part["status"], part["oldest_waiting_seconds"]) == ("healthy", 0)
+    service.wakeups.problem = "Timeout reading from socket"
+    part = service.json("GET", "/health", 503)["parts"]["queue"]
+    assert part["status"] == "degraded"
+    assert "Timeout reading from socket" in part["detail"]
+
+
+def test_extractors_are_degraded_while_a_job_waits_much_longer_than_usual(
+    service: Service,
+) -> None:
+    register(service, device="cpu", models=["test-tiny-avg"], errors={})
+    (photo,) = service.indexed(1)
+    job_id = UUID(service.upload(photo_bytes(2))["job_id"])
+    set_columns(service.catalog, job_id, created_at=db_now_plus(-3600))
+    assert extractors(service, 200)["status"] == "healthy", "a job has just finished"
+    with service.catalog.write() as session:
+        session.execute(
+            update(Job).where(Job.photo_id == UUID(photo)).values(finished_at=db_now_plus(-120))
+        )
+    deadline = time.monotonic() + 60.0  # the queue is measured every second, or less often
+    while service("GET", "/health").is_success and time.monotonic() < deadline:
+        time.sleep(0.1)
+    part = extractors(service, 503)
+    assert part["status"] == "degraded"
+    assert "waited for 36" in part["detail"]
+    assert "usual" in part["detail"]
+
+
 @pytest.fixture
 def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The path of DINO_WEIGHTS, where no file exists yet; before the settings are read."""
@@ -139,11 +169,10 @@ def test_a_worker_reports_missing_weights_until_the_model_is_loaded(
         get_map(session, "default").extractor = ANYLOC
     uploaded = service.upload(photo_bytes(1))
     service.drain()
-    assert service.worker.state() == {
-        "device": "cpu",
-        "models": [],
-        "errors": {ANYLOC: "weights_missing"},
-    }
+    state = service.worker.state()
+    assert (state["device"], state["models"]) == ("cpu", [])
+    assert state["errors"] == {ANYLOC: "weights_missing"}
+    assert "DINO_WEIGHTS" in state["error_details"][ANYLOC], "what to do"
     waited = service.json(
         "POST",
         "/upload",

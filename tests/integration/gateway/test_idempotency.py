@@ -28,10 +28,6 @@ from tests.integration.in_process_api import Service
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import field_refused, problem
 
-# tests/contract/catalog/test_idempotency.py runs the statements on SQLite, too;
-# tests/faults/test_repeated_calls.py kills gateways.
-pytestmark = pytest.mark.databases("postgresql")
-
 REPLAYED = "idempotent-replayed"
 
 

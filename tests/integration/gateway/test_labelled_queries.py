@@ -17,9 +17,6 @@ from tests.integration.in_process_api import Service
 from tests.integration.workplace import FIT, Workplace
 from tests.support.photos import near_copy, photo_bytes
 
-# tests/e2e/test_readme.py indexes and evaluates queries on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 
 def become(workplace: Workplace, role: PhotoRole, *photo_ids: UUID) -> None:
     """As `PATCH /uploads/{file_id}` does it."""

@@ -39,9 +39,6 @@ from tests.support.checkpoints import none_added
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
 
-# tests/e2e/test_maps.py does the same on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 
 class Away(Exception):
     pass
@@ -66,9 +63,7 @@ def live_in(service: Service, name: str) -> None:
     service.ask(near_copy(2), name)
     service.drain()
     service.json("POST", "/evaluations", 202, params=params)
-    evaluator = EvaluationWorker(
-        service.catalog, service.store, service.search, settings, "evaluator"
-    )
+    evaluator = EvaluationWorker(service.catalog, service.search, settings, "evaluator")
     assert evaluator.run_next(threading.Event())
     service.json("POST", "/vocabularies", 202, params=params, json={"clusters": 3, "seed": 5})
     finish_changes(service)
@@ -173,7 +168,9 @@ def test_a_deleted_map_leaves_no_row_and_no_byte_and_others_stay(
     live_in(service, "other")
     service.drain()  # nothing of it is left to do: from here on it stays as it is
     before = rows(catalog), objects(store)
+    generation = service.json("GET", "/maps/other")["generation_id"]
     live_in(service, "gone")
+    assert service.json("GET", "/maps/other")["generation_id"] == generation
     during = rows(catalog)
     of_no_map = {
         *("installation", "idempotency_keys", "api_keys", "live_processes"),
@@ -196,7 +193,7 @@ def test_a_deleted_map_leaves_no_row_and_no_byte_and_others_stay(
     assert answer["total_similar"] == 3
 
 
-def test_a_name_is_free_at_once_and_the_new_map_is_left_alone(
+def test_the_name_of_a_deleted_map_is_free_at_once(
     service: Service, catalog: Catalog, store: FolderStore
 ) -> None:
     service.json("POST", "/maps", 201, json={"name": "town"})
@@ -215,7 +212,7 @@ def test_a_name_is_free_at_once_and_the_new_map_is_left_alone(
     assert answer["similar_images"] == []
 
 
-def test_the_default_map_is_made_anew_and_empty(
+def test_a_deleted_default_map_is_created_again_empty(
     service: Service, catalog: Catalog, store: FolderStore
 ) -> None:
     service.indexed(1, 2)
@@ -231,7 +228,7 @@ def test_the_default_map_is_made_anew_and_empty(
 
 
 @pytest.mark.databases("sqlite", "postgresql")
-def test_deleting_a_map_by_many_at_once_deletes_it_once(service: Service) -> None:
+def test_concurrent_deletions_delete_a_map_once(service: Service) -> None:
     service.json("POST", "/maps", 201, json={"name": "town"})
     service.let_threads_call()
     with ThreadPoolExecutor(4) as pool:
@@ -242,7 +239,7 @@ def test_deleting_a_map_by_many_at_once_deletes_it_once(service: Service) -> Non
 
 
 @pytest.mark.databases("sqlite", "postgresql")
-def test_a_map_is_made_once_by_many_at_once(service: Service) -> None:
+def test_concurrent_creations_create_a_map_once(service: Service) -> None:
     def make(_: int) -> int:
         return service("POST", "/maps", json={"name": "town"}).status_code
 
@@ -254,7 +251,7 @@ def test_a_map_is_made_once_by_many_at_once(service: Service) -> None:
 # --- removing --------------------------------------------------------------------------------
 
 
-def test_removal_that_was_killed_anywhere_goes_on(
+def test_a_removal_that_is_killed_at_any_step_resumes(
     service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each round dies one deletion later than the one before; objects go before their rows."""
@@ -297,7 +294,7 @@ def _check_remembered(catalog: Catalog, store: FolderStore) -> None:
     assert {key for key in lying if key.startswith("chunks/") and key.endswith(".npy")} <= chunks
 
 
-def test_a_map_of_more_rows_than_one_transaction_takes_goes_as_well(
+def test_a_large_map_is_removed_in_several_transactions(
     service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(delete_maps, "ROWS_PER_TRANSACTION", 10)
@@ -327,7 +324,7 @@ def test_two_stewards_remove_a_map_together(
     assert rows(catalog) == before
 
 
-def test_what_is_being_removed_is_neither_merged_nor_renewed_nor_held_in_memory(
+def test_a_map_under_removal_is_not_compacted_reindexed_or_loaded(
     service: Service, catalog: Catalog, store: FolderStore, settings: Settings
 ) -> None:
     service.json("POST", "/maps", 201, json={"name": "gone"})

@@ -29,8 +29,6 @@ from tests.support.catalog_rows import add_job, add_photo, read_job, states
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
 
-pytestmark = pytest.mark.databases("postgresql")  # tests/e2e/test_maps.py does the same on SQLite
-
 
 class Away(Exception):
     pass
@@ -165,7 +163,7 @@ def test_uploads_while_their_map_is_deleted_are_refused_or_go_with_it(
     assert rows(catalog) == Counter({**before, "maps": before["maps"] - 1})
 
 
-def test_a_photo_that_slips_in_at_the_last_moment_is_removed_by_the_next_round(
+def test_a_photo_committed_during_a_removal_is_removed_by_the_next_round(
     service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its upload began before the deletion and commits after the steward has looked."""
@@ -186,7 +184,7 @@ def test_a_photo_that_slips_in_at_the_last_moment_is_removed_by_the_next_round(
     assert objects(store) == set()
 
 
-def test_a_job_that_slips_in_is_cancelled_before_anything_is_removed(
+def test_a_job_committed_after_the_deletion_is_cancelled_before_the_removal(
     service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service.json("POST", "/maps", 201, json={"name": "gone"})

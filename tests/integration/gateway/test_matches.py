@@ -124,7 +124,7 @@ def test_explain_returns_the_matching_points_of_a_stored_photo_at_once(
     assert (answer["matches"]["compared"], answer["matches"]["missing"]) == (1, 1)
 
 
-def test_matches_are_made_unasked_where_they_improve_the_answers(
+def test_matching_is_automatic_where_it_improves_the_answers(
     service: Service, ids: list[str]
 ) -> None:
     set_up(service, uses_matches=True)

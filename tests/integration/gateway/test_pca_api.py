@@ -55,7 +55,7 @@ def active(service: Service) -> Any:
     return found
 
 
-def test_a_map_is_reduced_says_so_and_goes_back(vlad: Service) -> None:
+def test_a_map_is_reduced_by_pca_and_restored(vlad: Service) -> None:
     whole = active(vlad)
     assert (whole["dimension"], whole["pca_from"]) == (32, None)
     result = done(vlad, post(vlad, "/generations", {"pca": 4}))
@@ -75,7 +75,7 @@ def test_a_map_is_reduced_says_so_and_goes_back(vlad: Service) -> None:
     assert get(vlad, "/maps/vlad")["pca_from"] is None
 
 
-def test_a_pca_that_can_not_be_is_refused_at_once(vlad: Service) -> None:
+def test_an_impossible_pca_is_refused_at_once(vlad: Service) -> None:
     field_refused(post(vlad, "/generations", {"pca": 33}), "pca")
     field_refused(post(vlad, "/generations", {"pca": 0}), "pca")
     field_refused(post(vlad, "/generations", {"pca": 1025}), "pca")
@@ -122,7 +122,7 @@ def test_the_file_of_a_vocabulary_of_unknown_origin_is_the_centres_alone(vlad: S
     assert answer.content == vlad.store.get(key)
 
 
-def test_a_vocabulary_that_is_not_there_or_not_what_was_stored_is_an_error(vlad: Service) -> None:
+def test_a_missing_or_corrupt_vocabulary_is_an_error(vlad: Service) -> None:
     missing = vlad("GET", f"/vocabularies/{uuid4()}/file", params={"map": "vlad"})
     problem(missing, 404, "vocabulary_not_found")
     (listed,) = get(vlad, "/vocabularies")

@@ -65,7 +65,8 @@ def test_the_levels_of_a_path_are_listed_finest_first_and_ever_more_probable(
     answer = ask(tower, 0, "tower", certainty=0.01)
     estimate = answer["estimate"]
     levels = [level["place"] for level in estimate["levels"]]
-    assert levels == ["tower/7/lift", "tower/7", "tower"]
+    assert levels == ["tower/7/lift", "tower/7", "tower", None]
+    assert [level["whole_map"] for level in estimate["levels"]] == [False] * 3 + [True]
     probabilities = [level["probability"] for level in estimate["levels"]]
     assert probabilities == sorted(probabilities)
     assert estimate["calibration_source"] == "prior", "20 photos leave the coefficients near it"
@@ -78,7 +79,7 @@ def test_the_levels_of_a_path_are_listed_finest_first_and_ever_more_probable(
     for field in ("in_map", "answer_level", "not_in_map_probability"):
         assert entry[field] == estimate[field]
     assert ask(tower, 0, "tower")["estimate"]["certainty"] == 0.95
-    assert [level["place"] for level in ask(tower, 5, "tower")["estimate"]["levels"]] == ["a"]
+    assert [level["place"] for level in ask(tower, 5, "tower")["estimate"]["levels"]] == ["a", None]
     assert ask(tower, 0, "tower", certainty=1)["estimate"]["answer_level"] is None
 
 
@@ -111,7 +112,7 @@ def test_the_map_setting_turns_labels_into_paths_and_back(service: Service) -> N
             changed = service.json("PATCH", "/maps/default", json=body)
             assert changed["place_labels_are_paths"] is are_paths
             assert changed["place_labels_are_automatic"] is (setting == "auto")
-        assert len(ask(service, 0)["estimate"]["levels"]) == (3 if are_paths else 1)
+        assert len(ask(service, 0)["estimate"]["levels"]) == (4 if are_paths else 2)
 
 
 def test_circles_are_the_levels_of_coordinates(service: Service) -> None:

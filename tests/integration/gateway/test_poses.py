@@ -25,7 +25,12 @@ from shared.catalog.photos import Photo
 from shared.catalog.reconstructions import ReconstructedComponent
 from shared.catalog.tracks import TrackFrame
 from shared.errors import NotFound, Unavailable
-from shared.evaluation.places.probability import PlaceModel, shipped_prior
+from shared.evaluation.places.probability import (
+    Background,
+    Elsewhere,
+    PlaceModel,
+    shipped_prior,
+)
 from shared.geodesy import distance_m
 from shared.geometry.component import quaternion_of
 from shared.geometry.frames import (
@@ -235,8 +240,11 @@ def test_query_without_a_pose_is_answered_with_the_reason(
             source="own_photos",
             own_photos=20,
             levels=((-5, *others),),
-            not_in_map=(9, *others),
-            in_map_limit=0.9,
+            elsewhere=Elsewhere(
+                coefficients=(9.0, 0.0, 0.0),
+                matched=(9.0, 0.0, 0.0, 0.0),
+                background=Background(mean=0.0, deviation=1.0),
+            ),
         )
         with service.catalog.write() as session:
             session.query(Photo).update({"place": "hall"})

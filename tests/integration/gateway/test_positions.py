@@ -24,6 +24,7 @@ def dated(name: str, seconds: float, latitude: float | None = None) -> dict[str,
         "captured_at": (NOON + timedelta(seconds=seconds)).isoformat(),
         "time_zone_is_known": True,
         "camera": "Camera",
+        "camera_is_unique": True,
         "latitude": latitude,
         "longitude": None if latitude is None else 7.0,
     }
@@ -48,8 +49,11 @@ def test_time_and_camera_are_read_from_the_begin_of_a_photo(service: Service) ->
         "captured_at": "2026-05-01T12:00:00Z",
         "time_zone_is_known": False,
         "camera": "Camera",
+        "camera_is_unique": False,
+        "clock_offset": None,
         "latitude": None,
         "longitude": None,
+        "gps_error": None,
         "focal_length": pytest.approx(27 / 36, rel=0.2),
     }
     refused = service("POST", "/photo-headers", content=b"no photo", headers=octets)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 from uuid import UUID
@@ -28,18 +28,11 @@ from shared.storage.s3 import S3Store
 from tests.integration.in_process_api import Service
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
-from tests.support.servers import S3Server, start_moto
+from tests.support.servers import S3Server
 
 pytestmark = pytest.mark.databases("sqlite")
 
 PHOTO = photo_bytes(1)
-
-
-@pytest.fixture(scope="module")
-def moto() -> Iterator[S3Server]:
-    """A bucket that takes whatever is sent: what is signed protects nothing there."""
-    with start_moto() as server:
-        yield server
 
 
 @pytest.fixture(params=["s3", "moto"])

@@ -140,7 +140,7 @@ def test_without_its_redis_a_gateway_answers_all_calls_and_says_so_once(
         assert "rate limits are on" in caplog.text
 
 
-def test_a_key_stores_so_many_photos_and_a_deleted_one_makes_room(
+def test_the_photo_quota_of_a_key_counts_live_photos(
     door: Door, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(store_photo, "FULL_RECOUNT_SECONDS", 0.0)

@@ -124,7 +124,7 @@ def test_every_url_in_an_answer_leads_to_its_map(service: Service) -> None:
     call("patch_photo", "PATCH", f"/uploads/{file_id}", json={"tags": ["a"]})
     call("search_metadata", "GET", "/search")
 
-    similar = call("similar_to_stored", "POST", f"/similarity/{file_id}")
+    call("similar_to_stored", "POST", f"/similarity/{file_id}")
     query = {"file": ("query.jpg", photo_bytes(5))}
     searched = call("similar_to_upload", "POST", "/similarity", files=query)
     call.until_it_ends(searched)
@@ -161,8 +161,6 @@ def test_every_url_in_an_answer_leads_to_its_map(service: Service) -> None:
     call("evaluate", "POST", "/evaluations")
     call.cancel(call("reconstruct", "POST", "/reconstructions"))
     call.cancel(call("import_reconstruction", "POST", "/reconstructions/import", json=COLMAP))
-    path = f"/generations/{similar['generation_id']}/word-weights"
-    call("learn_word_weights", "POST", path)
 
     openapi = service._app.openapi()
     assert call.called | DIRECT == operations_with_urls(openapi), "a call that is not followed"

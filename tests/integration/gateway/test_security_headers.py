@@ -72,7 +72,7 @@ def test_every_answer_has_the_headers_and_one_of_the_api_is_kept_by_no_cache(
     assert headers["content-security-policy"].startswith("default-src 'none'")
 
 
-def test_refusals_at_the_door_have_the_headers_too(door: Door) -> None:
+def test_responses_of_the_middleware_have_the_headers(door: Door) -> None:
     refused = door("wrong", "GET", "/jobs")
     problem(refused, 401, "key_unknown")
     checked(refused.headers)

@@ -366,7 +366,7 @@ def test_a_map_whose_place_model_finds_that_it_lacks_each_frame_is_not_tracked(
     service.drain()
     outside = {}
     for log_odds in (-3.0, 3.0):
-        model = PlaceModel(source="own_photos", not_in_map=(log_odds, *[0.0] * len(FEATURES)))
+        model = PlaceModel(source="own_photos", missing_place=(log_odds, *[0.0] * len(FEATURES)))
         with catalog.write() as session:
             session.execute(update(Generation).values(calibration=model.model_dump(mode="json")))
         track_id = begin(service)
@@ -379,7 +379,7 @@ def test_a_map_whose_place_model_finds_that_it_lacks_each_frame_is_not_tracked(
 
 
 @pytest.mark.databases("sqlite")
-def test_what_belongs_to_a_track_stays_and_goes_with_it(street: Service, catalog: Catalog) -> None:
+def test_rows_and_objects_of_a_track_are_deleted_with_it(street: Service, catalog: Catalog) -> None:
     pending, done = begin(street), begin(street)
     job_id = send(street, pending, 0)["job_id"]
     street.drain()

@@ -119,6 +119,7 @@ def original_of(service: Service, file_id: str) -> str:
         return session.get_one(Photo, UUID(file_id)).object_key
 
 
+@pytest.mark.databases("sqlite", "postgresql")
 def test_a_backup_goes_from_either_database_into_the_other_and_answers_the_same(
     service: Service,
     back_up: BackUp,

@@ -34,9 +34,6 @@ from tests.support.catalog_rows import add_job, add_map, expire_lease, take
 from tests.support.metrics import ADDED, exported, read
 from tests.support.photos import photo_bytes
 
-# tests/e2e/test_operations.py reads the metrics of a Placewise on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 DEPLOY = Path(__file__).parents[3] / "deploy"
 NAME = re.compile(r"\b(?:placewise_\w+|up)\b(?!\()")
 # PromQL's words and the labels that Prometheus itself gives.
@@ -90,8 +87,6 @@ def test_alerts_and_dashboards_name_only_what_the_services_export(
         "placewise_search_snapshot_version": {"generation"},
         "placewise_search_snapshot_lag_seconds": {"generation"},
         "placewise_search_snapshot_lag_versions": {"generation"},
-        "placewise_search_device_resident_bytes": {"device"},
-        "placewise_search_device_failed": {"device"},
         "placewise_extractor_device_used_bytes": {"device"},
         "placewise_extractor_device_total_bytes": {"device"},
         "placewise_steward_task_lag_seconds": {"task"},

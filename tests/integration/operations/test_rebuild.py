@@ -50,9 +50,6 @@ from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import add_job, add_reconstruction, stored_rows
 from tests.support.photos import photo_bytes
 
-# tests/faults/test_rebuild_catalog.py does the same on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 SAID: dict[str, Any] = {
     "latitude": 45.5,
     "longitude": 7.25,
@@ -372,7 +369,7 @@ def test_merged_chunks_give_each_photo_one_row(
     assert verify_store(service.catalog, store, originals=True).faults == []
 
 
-def test_uploads_of_the_last_seconds_come_back_though_the_journal_does_not_name_them(
+def test_uploads_that_the_journal_lacks_are_restored(
     service: Service,
     store: FolderStore,
     settings: Settings,
@@ -391,7 +388,7 @@ def test_uploads_of_the_last_seconds_come_back_though_the_journal_does_not_name_
     assert photo(service, found["image_id"])["place"] is None
 
 
-def test_a_home_of_before_the_journal_comes_back_with_what_exif_says(
+def test_a_store_without_a_journal_is_rebuilt_from_exif(
     service: Service,
     store: FolderStore,
     settings: Settings,

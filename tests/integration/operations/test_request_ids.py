@@ -24,9 +24,6 @@ from shared.telemetry.tracing import configure_tracing
 from tests.integration.in_process_api import Service
 from tests.support.photos import photo_bytes
 
-# tests/e2e/test_backup_and_verify.py finds the id of a call on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 ID = "from-the-proxy-17"
 
 

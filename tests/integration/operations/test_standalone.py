@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import pytest
-
 from services.standalone import run_standalone
 from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.jobs import JobState
 from tests.support.catalog_rows import add_job, add_map, read_job, take
-
-pytestmark = pytest.mark.databases("postgresql")
 
 
 def test_leases_in_a_shared_catalog_are_not_released_at_the_start(

@@ -21,9 +21,6 @@ from tests.integration.in_process_api import Service
 from tests.integration.workplace import Workplace
 from tests.support.catalog_rows import add_reconstruction
 
-# tests/e2e/test_backup_and_verify.py does the same on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 
 def looked(service: Service, *, originals: bool = False) -> IntegrityReport:
     return verify_store(service.catalog, service.store, originals=originals)
@@ -43,7 +40,7 @@ def mend(service: Service, report: IntegrityReport) -> int:
     return repair_descriptors(service.catalog, InProcessWakeups(), report)
 
 
-def test_a_whole_store_has_no_faults_and_the_bytes_of_a_deleted_photo_are_not_missed(
+def test_an_intact_store_has_no_faults_and_deleted_photos_need_no_objects(
     service: Service,
 ) -> None:
     first, *_ = service.indexed(1, 2, 3)

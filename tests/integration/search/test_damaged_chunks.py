@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import sqlite3
 from pathlib import Path
@@ -11,12 +12,14 @@ import pytest
 from sqlalchemy import event, func, select
 from sqlalchemy.exc import OperationalError
 
+from services.search import chunk_loader
 from shared.catalog.chunks import Chunk
 from shared.catalog.maps import Search
 from shared.config.shards import SINGLE_SHARD
 from shared.integrity.verify import repair_descriptors, verify_store
 from shared.jobs import InProcessWakeups
 from shared.storage import FolderStore, ObjectStore, read_retries
+from shared.storage.copying import download_object
 from shared.storage.s3 import S3Store
 from tests.integration.in_process_api import Service
 from tests.support.problems import problem
@@ -112,3 +115,29 @@ def test_a_search_is_answered_while_the_catalog_has_no_room_for_its_history(
     assert "is not added to the history" in caplog.text
     with service.catalog.read() as session:
         assert session.scalar(select(func.count()).select_from(Search)) == 0
+
+
+@pytest.mark.parametrize("store", ["bucket"], indirect=True)
+def test_a_full_disk_of_the_cache_is_not_taken_for_damage(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
+    service.indexed(1)
+    (searched,) = service.indexed(2)
+    chunk = first_chunk(service)
+
+    def full(store: ObjectStore, key: str, target: Path) -> str:
+        if key == chunk:
+            raise OSError(errno.ENOSPC, "No space left on device", str(target))
+        return download_object(store, key, target)
+
+    with monkeypatch.context() as disk:
+        disk.setattr(chunk_loader, "download_object", full)
+        service = restarted(service)
+        assert similar(service, searched)["missing"] == [chunk]
+        detail = service("GET", "/health").json()["parts"]["search"]["detail"]
+        assert "disk of a search worker is full" in detail
+        assert "--repair" not in detail
+    service.search.sync()
+    assert similar(service, searched)["missing"] == []
+    assert service("GET", "/health").json()["parts"]["search"]["status"] == "healthy"

@@ -21,9 +21,6 @@ from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import stored_rows
 from tests.support.photos import photo_bytes
 
-# tests/contract/search/test_search_worker.py searches float16 rows on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 
 def half_map(service: Service) -> list[str]:
     """A map `half` with five searchable photos in three chunks; their ids."""

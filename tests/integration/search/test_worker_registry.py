@@ -35,9 +35,6 @@ from tests.integration.workplace import Workplace
 from tests.support.catalog_rows import failure_code
 from tests.support.photos import photo_bytes
 
-# tests/e2e/test_search_service.py registers search workers on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 PHOTOS = 5
 WAIT_SECONDS = 30.0
 

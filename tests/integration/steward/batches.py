@@ -123,5 +123,5 @@ def restart(batches: Batches, job_id: UUID) -> BatchWorker:
     """Another steward, once the dead one's lease is over."""
     expire_lease(batches.catalog, job_id)
     with batches.catalog.write() as session:
-        assert reclaim_expired_leases(session) == 1
+        assert len(reclaim_expired_leases(session)) == 1
     return batches.new_worker()

@@ -30,9 +30,6 @@ from tests.support.catalog_rows import (
     set_columns,
 )
 
-# tests/e2e/test_estimates.py has a map on SQLite evaluated by itself.
-pytestmark = pytest.mark.databases("postgresql")
-
 LEAST = Settings().auto_evaluate_photos
 
 

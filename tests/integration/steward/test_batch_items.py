@@ -18,9 +18,6 @@ from tests.integration.steward.batches import Batches, codes, counts, files, lin
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 
-# tests/e2e/test_batches.py does the same on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 
 def test_each_bad_object_has_its_reason_and_the_others_come_in(batches: Batches) -> None:
     job_id = batches.start_import(
@@ -148,7 +145,7 @@ def test_a_batch_brings_in_no_more_than_the_extractors_have_room_for(batches: Ba
     assert counts(batches.finish(job_id, worker)) == (10, 10, 0)
 
 
-def test_an_upload_goes_before_the_photos_of_a_batch(batches: Batches) -> None:
+def test_uploads_have_priority_over_photos_of_batches(batches: Batches) -> None:
     batches.start(*files(*range(4)))
     batches.work()
     upload = batches.service.upload(photo_bytes(9))
@@ -157,7 +154,7 @@ def test_an_upload_goes_before_the_photos_of_a_batch(batches: Batches) -> None:
     assert str(first) == upload["job_id"]
 
 
-def test_batches_take_turns(batches: Batches, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_batches_are_processed_in_turn(batches: Batches, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker_module, "SLICE_SECONDS", 0.0)
     jobs = [batches.start(*files(*range(begin, begin + 3))) for begin in (0, 10)]
     monkeypatch.setattr(worker_module, "YIELD_SECONDS", 60.0)

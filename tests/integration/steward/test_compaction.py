@@ -23,9 +23,6 @@ from tests.integration.steward.chunk_map import HOUR_SECONDS, ChunkMap, Features
 from tests.integration.workplace import same
 from tests.support.catalog_rows import row_of, stored_rows
 
-# tests/faults/test_kills.py merges chunks on SQLite.
-pytestmark = pytest.mark.databases("postgresql")
-
 
 def test_small_chunks_of_an_open_slot_become_one_once_there_are_enough(chunk_map: ChunkMap) -> None:
     photo_ids = sum_of(chunk_map.chunks(2, 3))
@@ -154,7 +151,7 @@ def test_rows_that_no_photo_ever_had_are_dropped(chunk_map: ChunkMap) -> None:
     chunk_map.check_rows(photo_ids[2:])
 
 
-def test_merging_twice_at_once_merges_once(
+def test_concurrent_compactions_merge_once(
     chunk_map: ChunkMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photo_ids = sum_of(chunk_map.chunks(2, 3))

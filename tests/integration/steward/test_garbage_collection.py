@@ -154,7 +154,7 @@ def test_a_deleted_photos_bytes_go_at_once_and_its_row_after_the_grace(chunk_map
         assert get_photo(session, chunk_map.map_id, last).id == last
 
 
-def test_bytes_are_gone_before_the_row_that_remembers_them(
+def test_objects_are_deleted_before_their_rows(
     chunk_map: ChunkMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photo_id, _ = upload(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"the bytes")
@@ -174,7 +174,7 @@ def test_bytes_are_gone_before_the_row_that_remembers_them(
     assert chunk_map.objects("originals/") == set()
 
 
-def test_queries_go_when_their_time_is_over(chunk_map: ChunkMap) -> None:
+def test_objects_of_queries_are_deleted_after_their_retention(chunk_map: ChunkMap) -> None:
     old, young = (ask(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"q") for _ in range(2))
     for job_id in (old, young):
         chunk_map.store.put(query_vector_key(job_id), b"v")

@@ -267,7 +267,7 @@ def test_stray_files_stop_no_collection_and_go_with_the_orphans(chunk_map: Chunk
     assert chunk_map.objects() == live
 
 
-def test_more_orphans_than_one_run_takes_go_in_the_next_one(
+def test_orphans_beyond_the_limit_of_a_run_are_collected_by_the_next(
     chunk_map: ChunkMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(orphans_module, "OBJECTS_PER_LOOKUP", 3)

@@ -47,7 +47,7 @@ def upload_again(service: Service, data: bytes) -> Any:
     return answer.status_code, answer.json()
 
 
-def test_jobs_that_ended_long_ago_go_and_others_stay(service: Service, catalog: Catalog) -> None:
+def test_jobs_that_ended_long_ago_are_deleted(service: Service, catalog: Catalog) -> None:
     done = service.upload(photo_bytes(1))["job_id"]
     response = service.ask(near_copy(1))
     service.drain()
@@ -68,7 +68,7 @@ def test_jobs_that_ended_long_ago_go_and_others_stay(service: Service, catalog: 
     problem(service("GET", f"/jobs/{done}"), 404, "job_not_found")
 
 
-def test_a_described_photo_needs_its_job_no_more(service: Service, catalog: Catalog) -> None:
+def test_the_ended_job_of_a_described_photo_is_deleted(service: Service, catalog: Catalog) -> None:
     first = service.upload(photo_bytes(1))
     service.drain()
     age_jobs(catalog, DAYS + 1)
@@ -103,7 +103,7 @@ def test_a_photo_that_was_not_described_keeps_its_job_and_can_be_queued_again(
     service.json("DELETE", f"/uploads/{first['file_id']}")
 
 
-def test_searches_go_when_their_days_are_over(service: Service, catalog: Catalog) -> None:
+def test_searches_are_deleted_after_their_retention(service: Service, catalog: Catalog) -> None:
     (photo,) = service.indexed(1)
     for _ in range(2):
         service.json("POST", f"/similarity/{photo}")
@@ -117,7 +117,7 @@ def test_searches_go_when_their_days_are_over(service: Service, catalog: Catalog
     assert service.json("GET", "/database/stats")["total_searches"] == 1
 
 
-def test_more_than_one_transaction_takes_goes_in_several(
+def test_deletions_are_split_into_transactions(
     service: Service, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(maintenance, "RETENTION_ROWS_PER_TRANSACTION", 2)

@@ -38,12 +38,9 @@ from tests.support.catalog_rows import (
     upload,
 )
 
-# tests/e2e runs the scheduler on SQLite, in every embedded server.
-pytestmark = pytest.mark.databases("postgresql")
-
 
 @pytest.mark.databases("sqlite", "postgresql")
-def test_collecting_twice_at_once_harms_nothing(chunk_map: ChunkMap) -> None:
+def test_concurrent_garbage_collections_are_safe(chunk_map: ChunkMap) -> None:
     retained = sum_of(chunk_map.chunks(2, 2))
     chunk_map.merge_slot()
     gone = [
@@ -73,7 +70,7 @@ def test_collecting_twice_at_once_harms_nothing(chunk_map: ChunkMap) -> None:
         assert set(session.scalars(select(Photo.id))) == set(retained)
 
 
-def test_a_duty_that_raises_does_not_stop_the_others(
+def test_a_task_that_raises_does_not_stop_the_others(
     chunk_map: ChunkMap, settings: Settings
 ) -> None:
     steward = Scheduler(chunk_map.catalog, chunk_map.store, InProcessWakeups(), settings)
@@ -129,7 +126,7 @@ def test_a_long_task_with_a_thread_of_its_own_delays_no_other(
 
 
 @pytest.mark.databases("sqlite", "postgresql")
-def test_each_duty_is_done_by_the_loop(
+def test_the_loop_runs_each_task(
     chunk_map: ChunkMap, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One round does everything once: each task leaves its trace."""

@@ -47,7 +47,6 @@ from tests.support.catalog_rows import end_pauses
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 
-pytestmark = pytest.mark.databases("postgresql")
 BOTH_DATABASES = pytest.mark.databases("sqlite", "postgresql")
 PHOTOS = 6
 
@@ -243,7 +242,7 @@ def test_failed_deliveries_are_retried_later_under_the_same_id(hooks: WebhookSet
     assert first.body == second.body
 
 
-def test_pauses_grow_for_three_days_and_then_it_is_given_up(hooks: WebhookSetup) -> None:
+def test_retries_back_off_for_three_days_and_then_end(hooks: WebhookSetup) -> None:
     hooks.photo()
     hooks.receiver.status = 503
     for _ in range(len(RETRY_DELAYS_SECONDS)):
@@ -282,7 +281,7 @@ def test_a_redirect_is_not_followed(hooks: WebhookSetup) -> None:
     assert "redirects are not followed" in delivery["last_error"]
 
 
-def test_a_name_that_has_become_private_since_is_not_called(
+def test_a_host_that_has_become_private_is_not_called(
     hooks: WebhookSetup, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # As DNS rebinding does it: public when the webhook was made, loopback when it is called.
@@ -328,7 +327,7 @@ def test_the_connection_goes_to_the_address_that_was_checked(
 
 
 @pytest.mark.parametrize("hangs", ["handshake", "head", "body"])
-def test_a_receiver_that_hangs_is_not_waited_for(
+def test_a_delivery_to_a_hanging_receiver_times_out(
     hooks: WebhookSetup, localhost_tls: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch, hangs: str
 ) -> None:
     monkeypatch.setattr(webhooks_module, "ATTEMPT_SECONDS", 60.0 if hangs == "body" else 0.5)
@@ -448,7 +447,7 @@ def test_a_deleted_webhook_gets_nothing_more(hooks: WebhookSetup) -> None:
 
 
 @pytest.mark.parametrize("url", ["https://localhost/", "https://no-such-name.invalid/"])
-def test_a_webhook_to_a_machine_of_our_own_or_to_none_is_refused(
+def test_a_webhook_to_a_private_or_unresolvable_host_is_refused(
     sqlite_catalog: Catalog, store: FolderStore, url: str
 ) -> None:
     door = Door(sqlite_catalog, store, Settings())

@@ -23,7 +23,7 @@ from lab.datasets.ground_truth_files import write_integer_lists
 from lab.datasets.open_dataset import open_evaluation_set
 from lab.datasets.utm_coordinates import pairwise_distances_m
 from lab.evaluation.recall import recall_at_k
-from lab.training.model_describer import ModelDescriber
+from lab.training.describing import ModelDescriber
 from services.cli.main import build_app
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.vpr_models.checkpoint import checkpoint_state, load_checkpoint

@@ -71,7 +71,7 @@ def test_a_train_that_stands_where_the_one_of_the_map_did_not_stays_where_it_is(
     assert np.mean([frame.filter_is_right for frame in frames[30:]]) > 0.9
 
 
-def test_a_ride_that_is_carried_away_is_found_again(ride: Any) -> None:
+def test_a_kidnapped_camera_is_relocalised_on_a_real_ride(ride: Any) -> None:
     found, map_, rows = ride
     members = list(range(FIRST, len(rows)))
     frames = evaluate_kidnapped(map_, found, members, rows[members], TRAIN, 60)

@@ -6,9 +6,11 @@ import contextlib
 import os
 import shutil
 import signal
+import stat
 import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import psycopg
 import pytest
@@ -99,6 +101,7 @@ def _daemon(port: int, admin: URL, options: list[str]) -> Daemon:
     data = folder / "data"
     data.mkdir()
     if os.geteuid() == 0:  # which it refuses to run as
+        program = _copy_for_others(program, folder)
         for path in (folder, data):
             shutil.chown(path, "nobody")
     made = subprocess.run(
@@ -121,6 +124,17 @@ def _daemon(port: int, admin: URL, options: list[str]) -> Daemon:
     ]
     # SIGINT: it would wait for its clients on SIGTERM.
     return Daemon("PostgreSQL", command, folder, lambda: _answers(admin), signal.SIGINT)
+
+
+def _copy_for_others(program: Path, folder: Path) -> Path:
+    """Copy the package of `program` into `folder` if it lies below a folder that only root enters,
+    as an environment in `/root` does."""
+    if all(parent.stat().st_mode & stat.S_IXOTH for parent in program.parents):
+        return program
+    package = program.parents[2]
+    for part in (package, package.with_name(f"{package.name}.libs")):
+        shutil.copytree(part, folder / part.name)
+    return folder / program.relative_to(package.parent)
 
 
 def _answers(admin: URL) -> bool:

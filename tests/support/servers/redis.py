@@ -33,6 +33,21 @@ class RedisServer:
     process: Handle | None
     """None for one that was named: it is not ours to kill."""
 
+    def flush(self) -> None:
+        with Redis.from_url(self.url) as client:
+            client.flushall()
+
+    def fill(self) -> None:
+        """Let it refuse whatever needs memory, as the policy `noeviction` does at `maxmemory`."""
+        with Redis.from_url(self.url) as client:
+            client.config_set("maxmemory-policy", "noeviction")
+            client.config_set("maxmemory", "1")
+
+    def empty(self) -> None:
+        """Let it accept everything again."""
+        with Redis.from_url(self.url) as client:
+            client.config_set("maxmemory", "0")
+
 
 @contextlib.contextmanager
 def start_redis(*, own: bool = False) -> Iterator[RedisServer]:

@@ -50,7 +50,7 @@ def test_no_command_imports_a_database_a_server_or_torch_before_it_runs() -> Non
     assert imported.split() == []
 
 
-def test_the_collector_never_scans_what_a_command_has_imported() -> None:
+def test_imported_modules_are_frozen_for_the_garbage_collector() -> None:
     frozen = "print(gc.get_freeze_count() > 10_000, gc.isenabled())"
     assert printed_after("maps", "--help", code=frozen).endswith("True True\n")
 

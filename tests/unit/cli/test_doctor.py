@@ -54,7 +54,7 @@ def test_weights_that_fit_are_named_without_being_loaded(
     assert "GB) match" in reported
 
 
-def test_weights_without_the_chosen_layer_are_found_out(
+def test_weights_without_the_chosen_layer_are_reported(
     monkeypatch: pytest.MonkeyPatch, small: Path
 ) -> None:
     settings = settings_with(monkeypatch, DINO_MODEL="dinov2_vits14", DINO_WEIGHTS=small)
@@ -63,7 +63,7 @@ def test_weights_without_the_chosen_layer_are_found_out(
     assert caught.value.code == "weights_unusable"
 
 
-def test_missing_weights_come_with_three_ways_to_get_them(
+def test_missing_weights_are_reported_with_three_ways_to_get_them(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     from huggingface_hub import constants
@@ -97,7 +97,7 @@ def test_an_entry_of_torch_hub_is_tried_and_never_downloaded(
     assert "is unknown until it is loaded" in check_memory(Settings())
 
 
-def test_a_better_extractor_is_suggested_where_its_weights_and_a_gpu_are_here(
+def test_a_better_extractor_is_suggested_where_its_weights_and_a_gpu_are_available(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -134,14 +134,14 @@ def test_an_allowed_model_of_torch_hub_that_was_loaded_here_is_suggested_first(
     assert f"EXTRACTOR={name} " in str(suggest_extractor(settings))
 
 
-def test_the_suggestion_stands_behind_the_default_extractor(
+def test_the_suggestion_follows_the_default_extractor(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(installation_checks, "suggest_extractor", lambda _settings: "a better one")
     assert check_extractor(Settings()).endswith("; a better one")
 
 
-def test_missing_cuda_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_cuda_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     settings = settings_with(monkeypatch, DEVICE="cuda")
     for check in (check_device, check_memory):
@@ -176,7 +176,7 @@ def test_memory_that_is_enough_is_shown_with_the_estimate(monkeypatch: pytest.Mo
         ),
     ],
 )
-def test_memory_of_a_gpu_that_is_too_small_comes_with_what_to_do(
+def test_insufficient_gpu_memory_is_reported_with_a_remedy(
     monkeypatch: pytest.MonkeyPatch, gpu: int, settings: dict[str, str], remedies: str
 ) -> None:
     pretend_gpu(monkeypatch, gpu)
@@ -188,7 +188,7 @@ def test_memory_of_a_gpu_that_is_too_small_comes_with_what_to_do(
     assert ("BATCH_PHOTOS" in caught.value.detail) == ("BATCH_PHOTOS" in remedies)
 
 
-def test_ram_that_is_too_small_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_insufficient_ram_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(installation_checks, "memory_limit_bytes", lambda: 2 * GB)
     settings = settings_with(monkeypatch, DINO_MODEL="dinov2_vitl14", DEVICE="cpu")
     with pytest.raises(Misconfigured) as caught:

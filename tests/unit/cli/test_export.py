@@ -93,7 +93,7 @@ def test_a_map_without_queries_pairs_its_own_photos_but_those_without_a_descript
         (("a b.jpg",), "path", "by ID: --names id."),
     ],
 )
-def test_names_that_a_list_of_pairs_can_not_tell_apart_are_refused_with_names_that_it_can(
+def test_ambiguous_names_of_pairs_are_refused_with_the_option_that_separates_them(
     server: FakeServer, tmp_path: Path, photos: tuple[str, ...], names: str, remedy: str
 ) -> None:
     will_list(server, *(photo(name) for name in photos))

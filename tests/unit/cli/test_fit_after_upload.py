@@ -32,7 +32,7 @@ def jobs(*listed: Any) -> dict[str, Any]:
     return {"jobs": list(listed), "next_cursor": None}
 
 
-def test_a_fit_that_runs_is_waited_for_and_none_is_started() -> None:
+def test_a_running_fit_is_awaited_and_no_other_is_started() -> None:
     job, requests = wait(jobs(FIT), FIT, {**FIT, "state": "succeeded"})
     assert job is not None
     assert job.state == "succeeded"
@@ -40,11 +40,11 @@ def test_a_fit_that_runs_is_waited_for_and_none_is_started() -> None:
 
 
 @pytest.mark.parametrize(("photos", "next_fit"), [(49, 50), (500, None)])
-def test_a_map_that_is_not_due_is_not_waited_for(photos: int, next_fit: int | None) -> None:
+def test_no_fit_is_awaited_for_a_map_that_is_not_due(photos: int, next_fit: int | None) -> None:
     assert wait(jobs(), photos=photos, next_fit=next_fit)[0] is None
 
 
-def test_a_fit_that_starts_and_ends_between_two_looks_is_reported() -> None:
+def test_a_fit_that_starts_and_ends_between_two_polls_is_reported() -> None:
     ended = {**FIT, "state": "succeeded"}
     fitted = {**STATS, "total_images": 50, "next_fit_photos": 100}
     job, _ = wait(jobs(), fitted, jobs(), jobs(ended), ended)

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import unicodedata
 from pathlib import Path
 
 import pytest
+from PIL import Image
+from PIL.ExifTags import IFD, Base
 
 from services.cli.ingest.geotags import (
     LocalPhoto,
+    add_local_headers,
     count_other_files,
     find_local_sources,
     find_photos,
-    has_coordinates,
+    list_photos,
 )
+from services.cli.locate.sidecars import add_position
 from shared.errors import InvalidRequest
 from shared.utm_filenames import upload_fields_of_file_name
 from tests.support.photos import exif_with_position, photo_bytes
@@ -121,9 +126,15 @@ def test_coordinates_are_in_the_fields_or_in_the_exif(tmp_path: Path) -> None:
     plain, tagged = tmp_path / "plain.jpg", tmp_path / "tagged.jpg"
     plain.write_bytes(photo_bytes(1))
     tagged.write_bytes(photo_bytes(2, exif=exif_with_position(45.5, 7.25)))
-    assert not has_coordinates(LocalPhoto(plain, {}))
-    assert has_coordinates(LocalPhoto(plain, {"latitude": "45.5", "longitude": "7"}))
-    assert has_coordinates(LocalPhoto(tagged, {}))
+    for without, photo in (
+        (1, LocalPhoto(plain, {})),
+        (0, LocalPhoto(plain, {"latitude": "45.5", "longitude": "7"})),
+        (1, LocalPhoto(plain, {"latitude": "0.0", "longitude": "0"})),
+        (0, LocalPhoto(tagged, {})),
+    ):
+        photos, report = add_local_headers([photo], None)
+        assert report.without_coordinates == without
+        assert photos == [photo], "the server reads the EXIF itself"
 
 
 def test_folder_without_photos_is_an_error(tmp_path: Path) -> None:
@@ -168,3 +179,44 @@ def test_short_line_is_an_error_with_its_line(tmp_path: Path) -> None:
     error = refused(tmp_path, table_of(tmp_path, "place,filename\nhall\n"))
     assert error.code == "bad_table"
     assert "line 2" in error.detail
+
+
+def test_names_in_a_table_may_be_composed_otherwise_or_have_backslashes(tmp_path: Path) -> None:
+    decomposed = unicodedata.normalize("NFD", "Zürich/é.jpg")
+    make(tmp_path, decomposed, "day 1/a.jfif", "b.jpe")
+    rows = "Zürich\\é.jpg,day\nday 1\\a.jfif,night\nb.jpe,rain\n"
+    photos = find_photos(tmp_path, table_of(tmp_path, f"filename,tags\n{rows}"), None)
+    assert {photo.path.name: photo.fields["tags"] for photo in photos} == {
+        Path(decomposed).name: "day",
+        "a.jfif": "night",
+        "b.jpe": "rain",
+    }
+
+
+def test_copies_come_after_their_originals(tmp_path: Path) -> None:
+    names = ["a.jpg", "a (1).jpg", "a (2).jpg", "a (10).jpg", "a1.jpg"]
+    make(tmp_path, *names, ".placewise-locate/new/a.jpg")
+    assert [path.name for path in list_photos(tmp_path)] == names
+
+
+def test_sidecars_and_the_zone_of_the_camera_add_what_the_photos_lack(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[Base.Model] = "Camera"
+    exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = "2026:05:01 12:00:00"
+    zoned = Image.Exif()
+    zoned[Base.Model] = "Camera"
+    zoned.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = "2026:05:01 12:10:00"
+    zoned.get_ifd(IFD.Exif)[Base.OffsetTimeOriginal] = "+02:00"
+    (tmp_path / "1.jpg").write_bytes(photo_bytes(1, exif=exif))
+    (tmp_path / "1.xmp").write_bytes(add_position(None, 45.5, 7.25, 10.0))
+    (tmp_path / "2.jpg").write_bytes(photo_bytes(2, exif=zoned))
+    (tmp_path / "2.jpg.xmp").write_bytes(b"no XML")
+    found = find_photos(tmp_path, None, None)
+    photos, report = add_local_headers(found, None)
+    assert [photo.fields for photo in photos] == [
+        {"latitude": "45.5", "longitude": "7.25", "captured_at": "2026-05-01T10:00:00+00:00"},
+        {},
+    ]
+    assert [each["reason"] for each in report.not_understood] == ["its XMP is damaged"]
+    photos, _ = add_local_headers(find_photos(tmp_path / "1.jpg", None, None), "+05:00")
+    assert photos[0].fields["captured_at"] == "2026-05-01T07:00:00+00:00"

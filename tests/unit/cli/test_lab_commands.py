@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from services.cli import environment
 from services.cli.main import COMMANDS, LAB_COMMANDS, build_app, list_commands
 
 
@@ -18,11 +19,11 @@ def test_a_clone_has_the_commands_of_the_lab() -> None:
 
 def test_without_the_lab_only_its_commands_are_missing(tmp_path: Path) -> None:
     found = list_commands(tmp_path)
-    assert set(COMMANDS) - set(found) == set(LAB_COMMANDS) - {"evaluate", "compare"}
+    assert set(COMMANDS) - set(found) == set(LAB_COMMANDS) - {"evaluate"}
     assert {module.partition(".")[0] for _, module, _ in found.values()} == {"services"}
 
 
-@pytest.mark.parametrize("name", sorted(set(LAB_COMMANDS) - {"evaluate", "compare"}))
+@pytest.mark.parametrize("name", sorted(set(LAB_COMMANDS) - {"evaluate"}))
 def test_without_the_lab_its_commands_name_it(name: str, tmp_path: Path) -> None:
     app = build_app(["maps", "query"], list_commands(tmp_path))
     ended = CliRunner().invoke(app, [name, "--any", "option"])
@@ -35,15 +36,33 @@ def test_without_the_lab_its_commands_name_it(name: str, tmp_path: Path) -> None
     [
         (["evaluate", "--data", "folder"], "--data"),
         (["evaluate", "--predictions", "file"], "--predictions"),
-        (["compare", "folder", "--extractors", "patchnorm"], "compare DIR"),
     ],
 )
 def test_without_the_lab_commands_name_it_for_data_sets(
     arguments: list[str], named: str, tmp_path: Path
 ) -> None:
-    app = build_app(["evaluate", "compare", "maps"], list_commands(tmp_path))
+    app = build_app(["evaluate", "maps"], list_commands(tmp_path))
     ended = CliRunner().invoke(app, [*arguments, "--json"])
     assert ended.exit_code == 1
     problem = json.loads(ended.output)
     assert problem["code"] == "lab_missing"
     assert named in problem["detail"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["vocabulary", "fit", "{folder}", "--out", "city.npz"],
+        ["models", "fit-pca", "{folder}", "--out", "city.safetensors"],
+    ],
+)
+def test_fits_without_a_server_name_the_lab_where_it_is_missing(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(environment, "find_spec", lambda name: None)
+    filled = [argument.format(folder=tmp_path) for argument in arguments]
+    ended = CliRunner().invoke(build_app([arguments[0]]), [*filled, "--json"])
+    assert ended.exit_code == 1
+    problem = json.loads(ended.output)
+    assert problem["code"] == "lab_missing"
+    assert " ".join(arguments[:2]).removeprefix("models ") in problem["detail"]

@@ -87,7 +87,9 @@ def repository_zip(tmp_path: Path, comment: str = COMMIT) -> bytes:
 # --- list ------------------------------------------------------------------------------------
 
 
-def test_list_says_what_is_here_and_how_to_get_what_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_list_shows_available_weights_and_how_to_get_missing_ones(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.delenv("EXTRACTOR")
     here = listed("efficientnet-lite0-vlad")
     assert (here["available"], here["licence"]) == (True, "Apache-2.0")
@@ -135,7 +137,7 @@ def test_fingerprint_is_that_of_the_spec_and_is_computed_once(
     assert read == [file]
 
 
-def test_a_broken_memory_of_fingerprints_is_made_anew(caches: Path) -> None:
+def test_a_corrupt_cache_of_fingerprints_is_rebuilt(caches: Path) -> None:
     first = listed("efficientnet-lite0-vlad")
     memory = caches / "cache" / "placewise" / "fingerprints.json"
     assert first["fingerprint"] in memory.read_text()
@@ -158,7 +160,7 @@ def test_weights_are_fetched_ahead_of_time(server: FilesServer, vits_weights: by
     assert len(server.requests) == count, "a file that is present is not requested again"
 
 
-def test_a_file_that_is_not_what_the_hub_promises_is_refused(
+def test_a_downloaded_file_with_a_wrong_hash_is_refused(
     server: FilesServer, caches: Path, vits_weights: bytes
 ) -> None:
     server.promised[VITS_FILE] = vits_weights
@@ -215,9 +217,7 @@ def test_a_repository_is_fetched_at_its_commit_and_tried(
     assert not listed(REPOSITORY)["available"]
 
 
-def test_weights_of_an_entry_come_by_a_download_that_goes_on(
-    server: FilesServer, caches: Path
-) -> None:
+def test_weights_of_an_entry_are_downloaded_resumably(server: FilesServer, caches: Path) -> None:
     projection = np.random.default_rng(1).standard_normal((192, 24)).astype(np.float32)
     file = save({"projection": torch.from_numpy(projection)}, caches / "weights.pth")
     server.files["/weights.pth"] = file.read_bytes()
@@ -256,7 +256,7 @@ def test_an_archive_of_something_else_is_refused(
     assert not (caches / "torch" / "hub" / f"somebody_places_{COMMIT}").exists()
 
 
-def test_fetched_code_says_how_maps_may_use_it(caches: Path) -> None:
+def test_fetch_prints_the_setting_that_allows_the_code(caches: Path) -> None:
     name = f"torchhub:{write_hub(caches / 'hub', licence=None)}:colours"
     result = CliRunner().invoke(build_app(["models"]), ["models", "fetch", name])
     assert result.exit_code == 0, result.output

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-import pytest
 import typer
 from PIL import Image
 from typer.testing import CliRunner
@@ -21,7 +20,7 @@ from tests.support.photos import encoded
 PLACES = [
     {"place": "tower/floor 7 [east]/elevator", "probability": 0.614},
     {"place": "tower/floor 7 [east]", "probability": 0.972},
-    {"place": "tower", "probability": 1},
+    {"place": "tower", "probability": 0.98, "whole_map": True},
 ]
 CIRCLES = [
     {"latitude": 45.0, "longitude": 7.0, "radius_m": radius_m, "probability": probability}
@@ -34,6 +33,7 @@ app.command()(query_command)
 
 def estimate(levels: list[dict[str, Any]], **fields: Any) -> dict[str, Any]:
     return {
+        "headline": "In tower, floor 7 [east]: 97 %",
         "reason": "Not known yet.",
         "levels": levels,
         "answer_level": None,
@@ -85,9 +85,10 @@ def test_each_level_has_its_probability_and_a_bar_within_80_columns(tmp_path: Pa
         relative_path="Day 2/a[/b].jpg",
     )
     lines = shown.splitlines()
-    assert "97.2 % sure it is in tower/floor 7 [east]." in lines
+    assert "In tower, floor 7 [east]: 97 %" in lines
     for name, probability in (
-        *((level["place"], level["probability"]) for level in PLACES),
+        *((level["place"], level["probability"]) for level in PLACES[:2]),
+        ("in this map", 0.98),
         ("not in this map", 0.02),
     ):
         assert any(
@@ -100,16 +101,6 @@ def test_each_level_has_its_probability_and_a_bar_within_80_columns(tmp_path: Pa
     assert "61.4 %" in match
     tables = [row for row in lines if not row.endswith(".")]
     assert max(map(len, tables)) <= 80
-
-
-def test_a_finer_level_that_is_as_certain_is_explained(tmp_path: Path) -> None:
-    levels = [{**PLACES[0], "probability": 0.96}, *PLACES[1:]]
-    answered, _ = query(tmp_path, estimate(levels, answer_level=1))
-    assert "A finer answer needs clearer signs" in " ".join(answered.split())
-    unanswered, _ = query(tmp_path, estimate(levels))
-    assert "but it is not clear whether the place is in the map" in " ".join(unanswered.split())
-    plain, _ = query(tmp_path, estimate(PLACES, answer_level=1))
-    assert "clear" not in plain
 
 
 def test_a_long_label_leaves_room_for_the_probability_and_the_bar(tmp_path: Path) -> None:
@@ -128,42 +119,30 @@ def test_circles_are_named_by_their_radius_with_the_radii_of_68_and_95_percent(
         estimate(CIRCLES, answer_level=3, radius_68_m=79.4, radius_95_m=1750.2),
     )
     text = " ".join(shown.split())
-    assert "96.0 % sure it is within 2 km of 45.000000, 7.000000." in text
     assert "Position: 68 % within 79 m, 95 % within 1.8 km." in text
     for name in ("within 25 m", "within 100 m", "within 500 m", "within 2 km"):
         assert f"\n{name} " in shown
 
 
-@pytest.mark.parametrize(
-    ("outside", "has_place", "sentence"),
-    [
-        (0.62, True, "62.0 % sure that the map has no photo of this place."),
-        (0.1, False, "Probably not in this map."),
-        (
-            0.1,
-            True,
-            ("96.0 % sure it is within 2 km of 45.000000, 7.000000: an answer needs 99.5 %."),
-        ),
-    ],
-)
-def test_without_an_answer_one_sentence_gives_the_reason(
-    tmp_path: Path, outside: float, has_place: bool, sentence: str
-) -> None:
-    answer = estimate(CIRCLES, certainty=0.995, not_in_map_probability=outside)
-    answer |= {"has_place": has_place, "reason": "Probably not in this map."}
-    assert sentence in query(tmp_path, answer)[0].splitlines()
+def test_the_headline_and_the_reason_are_those_of_the_server(tmp_path: Path) -> None:
+    answer = estimate(CIRCLES, latitude=45.0, longitude=7.0)
+    answer |= {"headline": "Here, within 25 m: 97 %", "reason": "So it is."}
+    lines = query(tmp_path, answer)[0].splitlines()
+    at = lines.index("Here, within 25 m: 97 %. 45.000000, 7.000000")
+    assert lines[at + 1] == "So it is."
 
 
-def test_the_certainty_is_sent_to_the_server(tmp_path: Path) -> None:
-    _, path = query(tmp_path, estimate(PLACES), "--certainty", "0.8")
-    assert parse_qs(urlsplit(path).query)["certainty"] == ["0.8"]
+def test_certainty_and_share_from_elsewhere_are_sent_to_the_server(tmp_path: Path) -> None:
+    _, path = query(tmp_path, estimate(PLACES), "--certainty", "0.8", "--elsewhere", "0.1")
+    sent = parse_qs(urlsplit(path).query)
+    assert (sent["certainty"], sent["elsewhere"]) == (["0.8"], ["0.1"])
 
 
 def test_a_pose_is_a_table_of_80_columns_and_tab_separated_values_in_a_pipe(
     tmp_path: Path,
 ) -> None:
     options = ("--pose", "--focal-length", "0.8")
-    place: dict[str, Any] = {"reason": "No place is known."}
+    place: dict[str, Any] = {"headline": "No place.", "reason": "No place is known."}
     shown, path = query(tmp_path, place, *options, pose={"pose": POSE, "no_pose": None})
     sent = parse_qs(urlsplit(path).query)
     assert (sent["pose"], sent["focal_length"]) == (["true"], ["0.8"])
@@ -185,7 +164,7 @@ def test_a_pose_is_a_table_of_80_columns_and_tab_separated_values_in_a_pipe(
 
 
 def test_missing_coordinates_and_poses_are_explained(tmp_path: Path) -> None:
-    place: dict[str, Any] = {"reason": "No place is known."}
+    place: dict[str, Any] = {"headline": "No place.", "reason": "No place is known."}
     fields = dict.fromkeys(name for name in POSE if name.endswith(("_m", "itude", "_degrees")))
     pose = {**POSE, **fields, "heading": None, "reason": "All photos are on a line."}
     shown, path = query(tmp_path, place, pose={"pose": pose, "no_pose": None})
@@ -199,10 +178,10 @@ def test_missing_coordinates_and_poses_are_explained(tmp_path: Path) -> None:
 
 
 def test_an_answer_without_levels_has_neither_bars_nor_match_probabilities(tmp_path: Path) -> None:
-    shown, path = query(tmp_path, {"reason": "No place is known."})
-    assert "No estimate. No place is known." in shown.splitlines()
-    guess = {"latitude": 45.0, "longitude": 7.0, "radius_m": 25.0, "reason": "Not measured yet."}
-    assert "Best guess: 45.000000, 7.000000. Not measured yet." in query(tmp_path, guess)[0]
+    shown, path = query(tmp_path, {"headline": "No place.", "reason": "No place is known."})
+    assert "No place is known." in shown.splitlines()
+    guess = {"latitude": 45.0, "longitude": 7.0, "headline": "Best guess", "reason": "Not yet."}
+    assert "Best guess. 45.000000, 7.000000\nNot yet." in query(tmp_path, guess)[0]
     assert "probability" not in shown
     assert "match" not in shown
     assert "certainty" not in path

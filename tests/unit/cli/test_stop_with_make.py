@@ -21,7 +21,7 @@ def test_a_job_in_the_background_of_a_script_is_recognised() -> None:
         assert shown.stdout.strip() == expected, suffix
 
 
-def test_a_shell_that_has_ended_and_whose_status_nobody_reads_is_not_running() -> None:
+def test_a_zombie_shell_is_not_running() -> None:
     with subprocess.Popen(["sh", "-c", "exec sleep 60"]) as shell:
         assert _is_running(shell.pid)
         shell.kill()

@@ -56,7 +56,7 @@ def test_long_names_are_shortened_in_the_middle_to_fit_80_columns(
 
 @pytest.mark.usefixtures("terminal")
 def test_a_terminal_gets_no_escape_sequences_of_names(capsys: pytest.CaptureFixture[str]) -> None:
-    name = "\x1b]0;owned\x9b2J"
+    name = "\x1b]0;owned\x9b2J\u202egpj.exe"
     table = Table("photo", "text")
     table.add_row(name, f"a text with {name} in it")
     print_table(table)
@@ -64,10 +64,11 @@ def test_a_terminal_gets_no_escape_sequences_of_names(capsys: pytest.CaptureFixt
     with progress_bar() as progress:
         progress.add_task(name, total=1)
     printed = "".join(capsys.readouterr())
-    assert printed.count("\ufffd]0;owned\ufffd2J") == 3
+    assert printed.count("\ufffd]0;owned\ufffd2J\ufffdgpj.exe") == 3
     assert "\ufffd]0;owned" in printed.splitlines()[-2], "the progress bar"
     assert "\x1b]" not in printed
     assert "\x9b" not in printed
+    assert "\u202e" not in printed, "would show photo.exe as photoexe.jpg"
     assert "first line\n" in printed
 
 

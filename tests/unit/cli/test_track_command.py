@@ -129,7 +129,45 @@ def test_a_video_gives_a_frame_every_so_many_seconds(
     assert shades == pytest.approx([40, 100, 160], abs=8)
 
 
-def test_what_is_no_video_is_named_and_so_is_the_missing_decoder(
+@pytest.mark.parametrize(("rotation", "turns"), [(0, 0), (90, 1), (-90, 3), (180, 2), (-180, 2)])
+def test_frames_are_turned_as_the_display_matrix_of_the_video_says(
+    tmp_path: Path, rotation: int, turns: int
+) -> None:
+    """`rotation` is counterclockwise, as FFmpeg counts it."""
+    shown = np.zeros((48, 64, 3), np.uint8)
+    shown[:24, :32], shown[:24, 32:] = 250, 120  # brightest at the top left
+    path = tmp_path / "turned.mp4"
+    with av.open(str(path), "w") as container:
+        stored = np.ascontiguousarray(np.rot90(shown, -turns))
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.height, stream.width = stored.shape[:2]
+        stream.pix_fmt = "yuv420p"
+        stream.set_display_rotation(rotation) if rotation else None
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(stored, format="rgb24")))
+        container.mux(stream.encode())
+    (frame,) = read_video_frames(path, UNKNOWN, tmp_path)
+    found = np.asarray(Image.open(frame.path)).astype(int)
+    assert found.shape == shown.shape
+    assert abs(found - shown).mean() < 12
+
+
+def test_raw_stream_is_read_whole_by_the_frame_rate_that_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "raw.h264"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for number in range(30):
+            picture = np.full((48, 64, 3), 40 + 60 * (number // 10), dtype=np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode())
+    frames = list(read_video_frames(path, FrameTiming(1.0, None, NOON), tmp_path))
+    assert [(f.captured_at - NOON).total_seconds() for f in frames] == [0, 1, 2]
+    assert "10 frames a second are assumed" in capsys.readouterr().err
+
+
+def test_unreadable_videos_and_a_missing_decoder_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = tmp_path / "notes.txt"
@@ -234,7 +272,7 @@ def test_a_track_of_places_is_drawn_over_time(tmp_path: Path) -> None:
     assert located_segments(track_of(None)) == []
 
 
-def test_text_in_a_table_is_no_formula_for_a_spreadsheet(tmp_path: Path) -> None:
+def test_csv_cells_are_no_formulas_for_a_spreadsheet(tmp_path: Path) -> None:
     named = RIDE.frames[0].model_copy(update={"filename": "-1.jpg"})
     write_track_file(tmp_path / "ride.csv", RIDE.model_copy(update={"frames": [named]}), [])
     [row] = csv.DictReader((tmp_path / "ride.csv").read_text().splitlines())

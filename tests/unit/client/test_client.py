@@ -53,7 +53,7 @@ def client(server: FakeServer) -> Iterator[Client]:
         (507, StorageFull),
     ],
 )
-def test_refusals_come_back_as_the_errors_that_they_were(
+def test_problem_documents_are_raised_as_typed_errors(
     server: FakeServer, client: Client, status: int, kind: type[PlacewiseError]
 ) -> None:
     problem = kind("some_code", "Some detail.", file_id="abc").as_problem()
@@ -66,7 +66,7 @@ def test_refusals_come_back_as_the_errors_that_they_were(
 
 
 @pytest.mark.parametrize("body", [b"<html>Bad Gateway</html>", b"", b"null", b"{}"])
-def test_what_is_no_problem_document_is_shown_with_its_status(
+def test_other_error_responses_are_raised_with_their_status(
     server: FakeServer, client: Client, body: bytes
 ) -> None:
     server.will_answer(502, body)
@@ -189,7 +189,7 @@ def test_a_repeated_upload_sends_the_same_key_and_all_its_bytes_again(
     assert slept == [0.5, 7, 1]
 
 
-def test_each_call_has_a_key_of_its_own_and_only_what_makes_something_has_one(
+def test_only_creating_calls_send_an_idempotency_key_and_each_its_own(
     server: FakeServer, slept: list[float]
 ) -> None:
     deleted = {"success": True, "message": "", "deleted_file_id": PHOTO_ID}
@@ -205,7 +205,7 @@ def test_each_call_has_a_key_of_its_own_and_only_what_makes_something_has_one(
     assert keys[2:] == [None, None]
 
 
-def test_a_client_without_patience_repeats_nothing_and_sends_no_key(
+def test_a_client_without_retries_sends_no_idempotency_key(
     server: FakeServer, client: Client, photo: Path, slept: list[float]
 ) -> None:
     for error in (AWAY, TooManyRequests("queue_full", "Full.", retry_after_seconds=3)):
@@ -217,7 +217,7 @@ def test_a_client_without_patience_repeats_nothing_and_sends_no_key(
     assert slept == []
 
 
-def test_patience_ends_with_the_last_error(server: FakeServer, slept: list[float]) -> None:
+def test_retries_end_with_the_last_error(server: FakeServer, slept: list[float]) -> None:
     for _ in range(5):
         refuse(server, AWAY)
     with Client(server.url, patience_seconds=2) as client, pytest.raises(Unavailable) as caught:
@@ -251,7 +251,7 @@ def test_a_proxys_retry_after_is_obeyed_too(server: FakeServer, slept: list[floa
     [NotFound("photo_not_found", "None."), Conflict("photo_differs", "Other."), ValueError()],
     ids=lambda error: type(error).__name__,
 )
-def test_what_waiting_does_not_cure_is_not_repeated(
+def test_permanent_errors_are_not_retried(
     server: FakeServer, slept: list[float], error: Exception
 ) -> None:
     if isinstance(error, PlacewiseError):

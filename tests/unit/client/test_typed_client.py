@@ -67,7 +67,6 @@ SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
     (answers.Search, stats_module.SearchHistoryEntry),
     (answers.Map, maps.MapResponse),
     (answers.Stats, stats_module.StatsResponse),
-    (answers.WordWeights, evaluations.WordWeightsResponse),
     (answers.DeletedMap, maps.DeletedMapResponse),
     (answers.AddedModel, models.ModelResponse),
     (answers.RemovedModel, models.RemovedModelResponse),
@@ -136,7 +135,7 @@ def test_photos_are_fetched_page_after_page_as_they_are_reached(server: FakeServ
     assert all("map=lab" in path and "place=atrium" in path for _, path, _ in server.requests)
 
 
-def test_waiting_raises_what_the_job_has_failed_of(server: FakeServer) -> None:
+def test_wait_raises_the_error_of_a_failed_job(server: FakeServer) -> None:
     error = {"code": "undecodable_photo", "detail": "It is cut off.", "status": 422}
     server.will_answer(200, {**JOB, "state": "running"})
     server.will_answer(200, {**JOB, "state": "failed", "error": error})
@@ -203,14 +202,14 @@ def test_a_model_is_sent_with_its_name_and_the_progress_is_reported(
     assert sent[-1] == 300_000
 
 
-def test_an_answer_is_given_back_as_the_server_sent_it(server: FakeServer) -> None:
+def test_answers_serialise_to_the_json_that_the_server_sent(server: FakeServer) -> None:
     sent = {**SIMILAR, "similar_images": [{**PHOTO, "similarity_score": 1.0}], "newer": [1]}
     server.will_answer(200, sent)
     with placewise.connect(server.url) as places:
         assert places.similar(UUID(str(PHOTO["image_id"]))).as_json() == sent
 
 
-def test_waiting_ends_when_its_time_is_over(server: FakeServer) -> None:
+def test_wait_ends_at_its_timeout(server: FakeServer) -> None:
     server.will_answer(200, {**JOB, "state": "running"})
     with placewise.connect(server.url) as places, pytest.raises(placewise.Unavailable) as caught:
         places.wait(str(JOB["job_id"]), timeout_seconds=0)

@@ -43,7 +43,7 @@ def test_the_reserve_is_freed_on_a_full_disk_and_written_again_once_there_is_roo
     assert file.exists()
 
 
-def test_a_reserve_that_finds_no_room_leaves_nothing(
+def test_a_reserve_file_without_room_is_removed(
     tmp_path: Path, disk: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
@@ -54,7 +54,7 @@ def test_a_reserve_that_finds_no_room_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_object_store_leaves_the_last_of_the_disk_to_the_catalog(
+def test_the_object_store_keeps_free_space_for_the_catalog(
     tmp_path: Path, disk: SimpleNamespace
 ) -> None:
     store = FolderStore(tmp_path)

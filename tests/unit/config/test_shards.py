@@ -16,14 +16,14 @@ def test_every_slot_belongs_to_exactly_one_shard(slot: int, of: int) -> None:
     assert [Shard(index, of).owns(slot) for index in range(of)].count(True) == 1
 
 
-def test_a_shard_is_written_as_it_is_read() -> None:
+def test_a_shard_round_trips_as_text() -> None:
     assert Shard.parse(" 2/3 ") == Shard(2, 3)
     assert str(Shard(2, 3)) == "2/3"
     assert Shard.parse("0/1") == SINGLE_SHARD
 
 
 @pytest.mark.parametrize("text", ["", "3/3", "-1/3", "1", "1/0", "a/b", "1/2/3", "0.5/2"])
-def test_what_is_no_shard_is_refused(text: str) -> None:
+def test_malformed_shards_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match="is not a shard"):
         Shard.parse(text)
 

@@ -35,7 +35,7 @@ def photos(tmp_path: Path) -> Path:
     return tmp_path / "disk" / "photos"
 
 
-def test_unset_everything_lies_under_the_home(home: Path) -> None:
+def test_without_the_setting_originals_are_under_the_home(home: Path) -> None:
     assert place(home, None) == {}
     assert list(home.iterdir()) == []
 
@@ -80,7 +80,9 @@ def test_two_homes_never_share_a_folder(home: Path, photos: Path, tmp_path: Path
         assert str(tmp_path / other) in detail
 
 
-def test_photos_are_not_left_behind_in_the_folder_of_before(home: Path, photos: Path) -> None:
+def test_a_changed_folder_is_refused_while_the_former_one_has_photos(
+    home: Path, photos: Path
+) -> None:
     place(home, photos)
     assert str(photos) in refused(home, None, "upload_dir_changed")
     elsewhere = photos.with_name("elsewhere")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import re
 import sys
+import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -14,12 +16,19 @@ import numpy as np
 import pytest
 import torch
 from onnx import TensorProto, helper
+from onnx.numpy_helper import from_array
 from torch.nn.functional import normalize
 
 from shared.descriptors.backbones import normalise_pixels, probe_photos
 from shared.descriptors.backbones.exported import ExportedBackbone, exported_prefix
 from shared.descriptors.extractor import Extractor
-from shared.errors import Misconfigured, Unprocessable
+from shared.descriptors.onnx_process import (
+    PASS_SECONDS,
+    PHOTOS_PER_PASS,
+    OnnxProcess,
+    PassFailed,
+)
+from shared.errors import Misconfigured, Unavailable, Unprocessable
 from shared.extractor_config.configs import get_extractor_config, pooled_config
 from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
 from tests.support.exported import (
@@ -72,7 +81,11 @@ def operators(
         nodes,
         "graph",
         [helper.make_tensor_value_info("x", kind, shape)],
-        [helper.make_tensor_value_info("y", TensorProto.FLOAT, None)],
+        [
+            helper.make_tensor_value_info(
+                "y", TensorProto.FLOAT if kind == TensorProto.UINT8 else kind, None
+            )
+        ],
         constants,
     )
     opset = helper.make_opsetid("", 17)
@@ -206,6 +219,51 @@ def test_a_damaged_file_is_refused(kind: str, tiny_onnx: Callable[[bool], bytes]
         assert "can't be read" in refusal(f"{kind}:x:{SIZE}", damaged)
 
 
+def test_networks_of_half_precision_describe_as_their_copies_of_float32(tmp_path: Path) -> None:
+    half = copy.deepcopy(tiny_network()).half()
+    script = torchscript_of(half)
+    weights = half.projection.float().numpy()
+    nodes = [
+        helper.make_node("AveragePool", ["x"], ["a"], kernel_shape=[8, 8], strides=[8, 8]),
+        helper.make_node("Flatten", ["a"], ["f"]),
+        helper.make_node("MatMul", ["f", "w"], ["y"]),
+    ]
+    found, expected = (
+        backbone(f"onnx:half:{SIZE}", operators(nodes, [from_array(weights.astype(t), "w")], kind))
+        for t, kind in (("f2", TensorProto.FLOAT16), ("f4", TensorProto.FLOAT))
+    )
+    rows = expected.features(PHOTOS)
+    for network in (found, backbone(f"torchscript:half:{SIZE}", script)):
+        cosines = (network.features(PHOTOS) * rows).sum(dim=-1)
+        assert cosines.min() > 0.999
+    integers = [helper.make_node("Flatten", ["x"], ["y"])]
+    assert "tensor(int32)" in refusal(f"onnx:x:{SIZE}", operators(integers, [], TensorProto.INT32))
+
+
+class FixedBatch(torch.nn.Module):
+    """As traced code is: with the batch of its example."""
+
+    def forward(self, batch: torch.Tensor) -> torch.Tensor:
+        return torch.nn.functional.avg_pool2d(batch, 8).reshape(4, 192)
+
+
+class FixedDevice(torch.nn.Module):
+    """As traced code is: with the device of its example."""
+
+    def forward(self, batch: torch.Tensor) -> torch.Tensor:
+        return batch.flatten(1) + torch.zeros(1, device=torch.device("cuda:7"))
+
+
+def test_a_network_of_a_fixed_batch_or_another_device_is_refused_with_the_cause(
+    tmp_path: Path,
+) -> None:
+    data = onnx_of(tiny_network(), tmp_path, batch_size=4)
+    assert "fixed batch of 4 photos" in refusal(f"onnx:x:{SIZE}", data)
+    name = f"torchscript:x:{SIZE}"
+    assert "takes batches of 4 only" in refusal(name, torchscript_of(FixedBatch()))
+    assert "names the device cuda:7" in refusal(name, torchscript_of(FixedDevice()))
+
+
 def test_an_onnx_file_that_names_other_files_is_refused_with_how_to_save_it_as_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -275,6 +333,12 @@ def test_the_kind_of_a_file_is_known_from_its_content(tmp_path: Path) -> None:
     assert exported_prefix(checkpoint, "c.pt") is None
     assert exported_prefix(text, "t.pt") is None
     assert exported_prefix(text, "net.ONNX") == "onnx:"
+    # A name in the directory of the archive that is not UTF-8.
+    data = tiny_torchscript()
+    begin = data.rindex(b"/data.pkl")
+    damaged = data[:begin] + b"\xac" + data[begin + 1 :]
+    text.write_bytes(damaged)
+    assert exported_prefix(text, "t.pt") in (None, "torchscript:")
 
 
 def test_a_map_without_a_vocabulary_pools_the_patches_of_the_same_network() -> None:
@@ -292,3 +356,86 @@ def test_onnx_without_its_package_says_what_to_install(
     with pytest.raises(Misconfigured, match=re.escape(".[onnx]")) as caught:
         backbone(f"onnx:x:{SIZE}", tiny_onnx(False))
     assert caught.value.code == "onnx_missing"
+
+
+def endless_loop() -> bytes:
+    """`while True: x = x + 1`."""
+    body = helper.make_graph(
+        [
+            helper.make_node("Identity", ["goes_on"], ["goes_on_again"]),
+            helper.make_node("Add", ["sum", "sum"], ["next_sum"]),
+        ],
+        "body",
+        [
+            helper.make_tensor_value_info("i", TensorProto.INT64, []),
+            helper.make_tensor_value_info("goes_on", TensorProto.BOOL, []),
+            helper.make_tensor_value_info("sum", TensorProto.FLOAT, []),
+        ],
+        [
+            helper.make_tensor_value_info("goes_on_again", TensorProto.BOOL, []),
+            helper.make_tensor_value_info("next_sum", TensorProto.FLOAT, []),
+        ],
+    )
+    nodes = [
+        helper.make_node("Loop", ["", "true", "zero"], ["z"], body=body),
+        helper.make_node("ReduceMean", ["x"], ["mean"], axes=[2, 3], keepdims=0),
+        helper.make_node("Add", ["mean", "z"], ["y"]),
+    ]
+    true = helper.make_tensor("true", TensorProto.BOOL, [], [True])
+    zero = helper.make_tensor("zero", TensorProto.FLOAT, [], [0.0])
+    return operators(nodes, [true, zero])
+
+
+def nested_functions(levels: int = 40) -> bytes:
+    """Each function calls the one before twice: 2^levels operators, when they are inlined."""
+    opsets = [helper.make_opsetid("", 17), helper.make_opsetid("own", 1)]
+    functions = []
+    for level in range(levels):
+        inner = ("Identity", "") if level == 0 else (f"f{level - 1}", "own")
+        calls = [
+            helper.make_node(inner[0], [source], [target], domain=inner[1])
+            for source, target in (("a", "b"), ("b", "c"))
+        ]
+        functions.append(helper.make_function("own", f"f{level}", ["a"], ["c"], calls, opsets))
+    graph = helper.make_graph(
+        [
+            helper.make_node("ReduceMean", ["x"], ["mean"], axes=[2, 3], keepdims=0),
+            helper.make_node(f"f{levels - 1}", ["mean"], ["y"], domain="own"),
+        ],
+        "graph",
+        [helper.make_tensor_value_info("x", TensorProto.FLOAT, ("n", 3, SIDE, SIDE))],
+        [helper.make_tensor_value_info("y", TensorProto.FLOAT, None)],
+    )
+    model = helper.make_model(graph, functions=functions, opset_imports=opsets, ir_version=9)
+    data: bytes = model.SerializeToString()
+    return data
+
+
+@pytest.mark.parametrize("make", [endless_loop, nested_functions])
+def test_an_onnx_file_that_never_ends_is_refused_after_its_time(
+    make: Callable[[], bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shared.descriptors.onnx_process.PASS_SECONDS", 8.0)
+    assert "more than 8 s" in refusal(f"onnx:x:{SIZE}", make())
+
+
+def test_a_pass_ends_when_the_extractor_stops_and_the_network_goes_on_after_a_failed_pass(
+    tiny_onnx: Callable[[bool], bytes],
+) -> None:
+    asked: list[int] = []
+
+    def is_stopping() -> bool:
+        asked.append(1)
+        return len(asked) > 3
+
+    started = time.monotonic()
+    with pytest.raises(Unavailable) as stopped:
+        ExportedBackbone(config_of(f"onnx:x:{SIZE}"), endless_loop(), CPU, is_stopping=is_stopping)
+    assert stopped.value.code == "extractor_stopping"
+    assert time.monotonic() - started < PASS_SECONDS
+    process = OnnxProcess(tiny_onnx(False), 1)
+    with pytest.raises(PassFailed):
+        process(np.zeros((1, 3, 5, 5), np.float32))
+    batch = np.random.default_rng(1).random((2 * PHOTOS_PER_PASS + 1, 3, SIDE, SIDE), np.float32)
+    expected = tiny_network()(torch.from_numpy(batch))
+    np.testing.assert_allclose(process(batch), expected, rtol=1e-4, atol=1e-4)

@@ -107,7 +107,7 @@ def test_options_are_taken() -> None:
         ),
     ],
 )
-def test_one_extractor_has_one_name(written: str, canonical: str) -> None:
+def test_equivalent_names_have_one_canonical_form(written: str, canonical: str) -> None:
     found = config(written)
     assert found.name == ("anyloc-vitb14:" + canonical).rstrip(":")
     assert config(found.name) == found
@@ -256,7 +256,7 @@ def test_the_pooled_form_of_a_vlad_extractor_keeps_its_local_features(
         ("gsv:a+torchscript:b@0.25", "gsv:a@0.8+torchscript:b@0.2"),
     ],
 )
-def test_two_extractors_side_by_side_have_one_name(written: str, canonical: str) -> None:
+def test_two_extractors_side_by_side_have_one_canonical_name(written: str, canonical: str) -> None:
     config = get_extractor_config(written, allow_test_extractors=True)
     assert config.name == canonical
     assert get_extractor_config(canonical, allow_test_extractors=True) == config
@@ -271,6 +271,8 @@ def test_two_extractors_side_by_side_have_one_name(written: str, canonical: str)
         ("test-tiny-vlad+test-tiny-vlad", "bad_extractor_option"),
         ("patchnorm+patchnorm+patchnorm", "bad_extractor_option"),
         ("patchnorm@0+test-tiny-avg@1", "bad_extractor_option"),
+        ("onnx:a@0.0001+onnx:b@9999", "bad_extractor_option"),
+        ("onnx:a@9999+onnx:b@1", "bad_extractor_option"),
         ("patchnorm+anyloc-vits14:aggregator=gem,preprocessing=round14", "bad_extractor_option"),
         ("patchnorm+nobody", "unknown_extractor"),
         ("+patchnorm", "bad_extractor_option"),

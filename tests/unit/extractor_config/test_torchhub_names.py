@@ -32,7 +32,7 @@ def test_a_repository_is_read_with_its_commit_entry_and_arguments() -> None:
     assert (hub.input.height, hub.input.width, hub.input.mean) == (224, 224, IMAGENET_MEAN)
 
 
-def test_a_folder_is_read_with_what_its_network_wants_to_see() -> None:
+def test_a_folder_is_parsed_with_its_preprocessing() -> None:
     hub = parse_torchhub_name(
         "torchhub:/models/mine/:entry:input.size=322x644,input.mean=0.5/0.5/0.25"
     )
@@ -55,7 +55,7 @@ def test_a_folder_is_read_with_what_its_network_wants_to_see() -> None:
         ("a:b", "a:b"),
     ],
 )
-def test_arguments_have_the_types_that_they_look_like(written: str, value: object) -> None:
+def test_argument_types_follow_from_their_literals(written: str, value: object) -> None:
     hub = parse_torchhub_name(f"{REPOSITORY}:x={written}")
     assert hub.arguments == (("x", value),)
     assert type(hub.arguments[0][1]) is type(value)
@@ -73,7 +73,7 @@ def test_arguments_have_the_types_that_they_look_like(written: str, value: objec
         ("input.mean=0.4850001/0.456/0.406", "input.mean=0.4850001/0.456/0.406"),
     ],
 )
-def test_one_network_has_one_name(written: str, canonical: str) -> None:
+def test_equivalent_names_have_one_canonical_form(written: str, canonical: str) -> None:
     config = get_extractor_config(f"{REPOSITORY}:{written}", allow_test_extractors=False)
     assert config.name == f"{REPOSITORY}:{canonical}".rstrip(":")
     assert get_extractor_config(config.name, allow_test_extractors=False) == config

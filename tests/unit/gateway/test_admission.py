@@ -32,7 +32,7 @@ def test_concurrent_uploads_into_many_maps_are_admitted_up_to_the_limit_exactly(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        admission_module, "measure_queue_depth", lambda *_: QueueDepth({}, 0, finished_per_second=0)
+        admission_module, "measure_queue_depth", lambda *_: QueueDepth({}, 0, finished=0)
     )
     monkeypatch.setattr(admission_module, "ADMISSION_POLL_SECONDS", 3600.0)
     settings = Settings(placewise_home=tmp_path, min_free_bytes=0, max_queued_jobs=LIMIT)

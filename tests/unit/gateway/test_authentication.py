@@ -39,7 +39,7 @@ KEY = "pw_0123456789abcdef"
 
 
 @pytest.mark.parametrize("header", ["Bearer abc", "bEARER abc", "Bearer   abc "])
-def test_the_key_is_read_whatever_the_schemes_case(header: str) -> None:
+def test_the_bearer_scheme_is_case_insensitive(header: str) -> None:
     assert parse_bearer(header) == "abc"
 
 
@@ -75,7 +75,7 @@ def check(keys: Authenticator, **headers: str) -> Caller:
     return asyncio.run(keys.authenticate(Headers(headers)))
 
 
-def test_any_of_the_keys_beside_the_catalog_opens_everything(none_stored: Catalog) -> None:
+def test_configured_keys_have_every_scope(none_stored: Catalog) -> None:
     keys = ApiKeyAuthenticator(none_stored, hash_api_key(KEY), hash_api_key("another"))
     assert check(keys, authorization=f"Bearer {KEY}").scopes == set(Scope)
     check(keys, authorization="Bearer another", origin="https://elsewhere.example")
@@ -98,7 +98,7 @@ def test_while_the_catalog_is_unreachable_only_the_configured_keys_are_accepted(
     away.close()
 
 
-def test_a_key_is_long_random_and_shows_little_of_itself() -> None:
+def test_a_key_is_long_and_random_and_its_prefix_is_short() -> None:
     made = {generate_api_key() for _ in range(100)}
     assert len({api_key_prefix(key) for key in made}) == 100
     for key in made:
@@ -119,7 +119,7 @@ def test_loopback_addresses_are_those_that_only_this_machine_reaches(
     assert is_loopback(host) is expected
 
 
-def test_an_admin_may_everything_and_no_other_scope_implies_one() -> None:
+def test_the_admin_scope_implies_all_and_no_other_implies_one() -> None:
     assert expand_scopes([Scope.ADMIN]) == set(Scope)
     assert expand_scopes([Scope.WRITE]) == {Scope.WRITE}
     assert expand_scopes([Scope.READ, Scope.WRITE]) == {Scope.READ, Scope.WRITE}
@@ -147,7 +147,7 @@ def test_without_keys_calls_on_loopback_are_allowed(host: str) -> None:
         {"host": "localhost:8000", "origin": ""},
     ],
 )
-def test_without_keys_no_page_of_elsewhere_may_call(fields: dict[str, str]) -> None:
+def test_without_keys_cross_origin_calls_are_refused(fields: dict[str, str]) -> None:
     with pytest.raises(Forbidden) as caught:
         check(LocalhostAuthenticator(), **fields)
     assert caught.value.code == "foreign_page"
@@ -166,7 +166,7 @@ def test_without_keys_what_a_proxy_forwards_is_refused(header: str) -> None:
     assert header.lower() in caught.value.detail.lower()
 
 
-def test_without_keys_a_page_that_is_trusted_may_call_this_machine() -> None:
+def test_without_keys_a_trusted_origin_may_call_loopback() -> None:
     keys = LocalhostAuthenticator(["https://maps.example"])
     check(keys, host="localhost:8000", origin="https://maps.example")
     for reported in ({"origin": "https://maps.example.evil"}, {"host": "maps.example"}):
@@ -178,7 +178,7 @@ def test_without_keys_a_page_that_is_trusted_may_call_this_machine() -> None:
 
 
 @pytest.mark.parametrize("value", ["short", "x" * 15, "with a blank in it all", "schlüssel" * 4])
-def test_a_chosen_key_that_can_be_guessed_or_not_be_sent_is_refused(
+def test_a_weak_or_unsendable_admin_key_is_refused(
     monkeypatch: pytest.MonkeyPatch, value: str
 ) -> None:
     monkeypatch.setenv("ADMIN_KEY", value)
@@ -199,7 +199,7 @@ def test_a_chosen_key_is_masked_and_an_empty_one_is_none(monkeypatch: pytest.Mon
 # --- the folder ------------------------------------------------------------------------------
 
 
-def test_what_is_written_privately_is_readable_by_its_user_alone(tmp_path: Path) -> None:
+def test_private_files_are_readable_by_their_owner_alone(tmp_path: Path) -> None:
     file = tmp_path / "secret"
     file.write_text("an old one that everyone could read")
     file.chmod(0o644)

@@ -11,7 +11,7 @@ import uvicorn
 from services.http_server import lan_url, reachable_url, stop_on_signals
 
 
-def test_an_address_of_the_network_is_its_own_url_and_loopback_has_none_for_others() -> None:
+def test_lan_url_is_that_of_a_network_address_and_none_for_loopback() -> None:
     assert lan_url("192.168.1.23", 8000) == "http://192.168.1.23:8000"
     for host in ("127.0.0.1", "::1", "localhost"):
         assert lan_url(host, 8000) is None

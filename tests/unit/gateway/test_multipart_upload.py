@@ -147,7 +147,7 @@ def test_pieces_of_any_size_give_the_same_file_and_fields(store: FolderStore, si
 
 
 @pytest.mark.parametrize("size", [1, 5, 10**9])
-def test_file_that_is_full_of_almost_boundaries_is_whole(store: FolderStore, size: int) -> None:
+def test_file_full_of_partial_boundaries_is_stored_whole(store: FolderStore, size: int) -> None:
     tricky = b"\xff\xd8\xff" + b"\r\n--the-boundar\r\n--\r\n\r\n-the-boundary--\r\n" * 20
     receive(store, Body(in_pieces(file(tricky) + END, size)))
     assert store.get(KEY) == tricky
@@ -163,7 +163,7 @@ def test_first_bytes_are_checked_once_and_whole(store: FolderStore, size: int) -
     assert seen == [PHOTO[:16], b"BM12"]
 
 
-def test_what_is_no_photo_is_refused_without_reading_the_rest(store: FolderStore) -> None:
+def test_unsupported_file_is_refused_without_reading_the_rest(store: FolderStore) -> None:
     body = Body(in_pieces(file(b"this is a text, not a photo " * 2000) + END, 200))
     error = refused(store, body, check_begin=check_photo_signature)
     assert isinstance(error, UnsupportedMedia)
@@ -209,13 +209,13 @@ def test_text_fields_over_their_limit_are_refused_without_reading_the_rest(
     ],
     ids=["behind the end", "empty fields"],
 )
-def test_body_that_goes_on_for_ever_is_refused(store: FolderStore, endless: bytes) -> None:
+def test_endless_body_is_refused(store: FolderStore, endless: bytes) -> None:
     body = Body(in_pieces(file() + endless, 10_000), cut_off=True)
     assert refused(store, body).code == "file_too_large"
     assert body.left > 0
 
 
-def test_part_header_that_goes_on_for_ever_is_refused(store: FolderStore) -> None:
+def test_endless_part_header_is_refused(store: FolderStore) -> None:
     endless = f"--{BOUNDARY}\r\nContent-Disposition: ".encode() + b"x" * 1_000_000
     body = Body(in_pieces(endless, 1000), cut_off=True)
     assert refused(store, body).code == "malformed_body"
@@ -252,7 +252,7 @@ def test_a_client_that_disconnects_leaves_no_object(store: FolderStore) -> None:
         (file(b"", "") + END, "empty_file", "empty"),
     ],
 )
-def test_a_form_with_another_number_of_files_than_one_is_refused(
+def test_a_form_without_exactly_one_file_is_refused(
     store: FolderStore, body: bytes, code: str, named: str
 ) -> None:
     error = refused(store, body)
@@ -311,7 +311,7 @@ def test_bodies_that_cannot_be_read_are_refused(store: FolderStore, body: bytes)
     assert refused(store, body).code == "malformed_body"
 
 
-def test_what_was_there_under_the_key_survives_a_refused_body(store: FolderStore) -> None:
+def test_a_refused_body_replaces_no_existing_object(store: FolderStore) -> None:
     store.put(KEY, b"there before")
     with pytest.raises(InvalidRequest):
         receive(store, file()[:-100])

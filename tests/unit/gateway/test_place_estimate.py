@@ -5,18 +5,28 @@ from __future__ import annotations
 from uuid import UUID
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from services.gateway.schemas import EstimateResponse
-from services.gateway.similarity.estimate import estimate_place, locate_hits
+from services.gateway.schemas import CameraPoseResponse, EstimateResponse
+from services.gateway.similarity.estimate import estimate_place, locate_hits, place_at_pose
 from shared.catalog.photos import Photo
 from shared.evaluation.places.evidence import (
     PhotoLocation,
     RankedPhoto,
     estimate_location,
 )
-from shared.evaluation.places.levels import LevelScheme
-from shared.evaluation.places.probability import PlaceModel
+from shared.evaluation.places.levels import CandidateLevel, LevelScheme
+from shared.evaluation.places.probability import (
+    Background,
+    Elsewhere,
+    MapExtent,
+    PlaceEstimate,
+    PlaceModel,
+    error_radius_m,
+)
 from shared.search_api.protocol import SearchHit
+from tests.support.api_responses import POSE
 
 pytestmark = pytest.mark.numerics
 
@@ -84,47 +94,120 @@ def answer(
     located = locate_hits(hits, photos)
     shown = [ranked for ranked in located if (ranked.score, ranked.location) in found]
     estimate = model.estimate(located, [], SCHEME, 0.95, RADIUS_M, shown)
-    return estimate_place(estimate, 0.95, RADIUS_M, "no place")
+    return estimate_place(estimate, 0.95, 0.33, "no place")
 
 
-def fitted(limit: float | None) -> PlaceModel:
-    return PlaceModel(source="own_photos", own_photos=100, in_map_limit=limit)
+def fitted(log_odds: float) -> PlaceModel:
+    """A model with the log-odds of "elsewhere" at a prior of one half."""
+    elsewhere = Elsewhere(
+        coefficients=(log_odds, 0.0, 0.0),
+        matched=(0.0,) * 4,
+        background=Background(mean=0.0, deviation=1.0),
+    )
+    extent = MapExtent(diameter_m=3000)
+    return PlaceModel(source="own_photos", own_photos=100, elsewhere=elsewhere, extent=extent)
 
 
 def test_before_an_evaluation_the_place_is_given_and_nothing_is_claimed_of_it() -> None:
     reported = answer(PlaceModel(), *EVERYTHING)
     assert (reported.in_map, reported.confidence, reported.calibration_source) == (None,) * 3
     assert reported.latitude == pytest.approx(45.0)
-    assert reported.radius_m == RADIUS_M
+    assert "has not been measured" in reported.headline
     assert "not measured yet" in reported.reason
 
 
-def test_too_few_evaluated_photos_leave_open_whether_the_place_is_in_the_map() -> None:
-    reported = answer(fitted(None), *EVERYTHING)
-    assert reported.in_map is None
-    assert reported.confidence is not None
-    assert "Too few photos" in reported.reason
-
-
-def test_a_query_is_in_the_map_if_not_in_map_is_less_probable_than_the_limit() -> None:
-    inside, outside = answer(fitted(1.0), *EVERYTHING), answer(fitted(0.0), *EVERYTHING)
-    assert (inside.in_map, outside.in_map) == (True, False)
+def test_a_query_is_in_the_map_elsewhere_or_neither_is_certain() -> None:
+    inside, open_, outside = (answer(fitted(x), *EVERYTHING) for x in (-9.0, 0.0, 9.0))
+    assert [each.in_map for each in (inside, open_, outside)] == [True, None, False]
     assert inside.latitude is not None
+    assert open_.headline.startswith("Not certain. Best guess")
     assert (outside.latitude, outside.longitude, outside.radius_m, outside.place) == (None,) * 4
-    assert outside.reason.startswith("Probably not in this map")
+    assert outside.headline == "Probably not in this map: more than 99 %"
+
+
+@given(
+    probabilities=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=4).map(sorted),
+    certainty=st.sampled_from([0.5, 0.8, 0.95, 0.99]),
+    of_labels=st.booleans(),
+    pose_m=st.none() | st.floats(0.1, 3000),
+)
+def test_headline_levels_and_fields_of_an_estimate_agree(
+    probabilities: list[float], certainty: float, of_labels: bool, pose_m: float | None
+) -> None:
+    model = PlaceModel(source="own_photos")
+    last = len(probabilities) - 1
+    levels = [
+        CandidateLevel(
+            place=f"level {n}" if of_labels else None,
+            latitude=None if of_labels else 45.0,
+            longitude=None if of_labels else 7.0,
+            radius_m=None if of_labels else 25.0 * 4**n,
+            is_whole_map=n == last,
+        )
+        for n in range(last + 1)
+    ]
+    missing = 1 - probabilities[-1]
+    given_ = PlaceEstimate(
+        model=model,
+        location=PhotoLocation(None, None, "a") if of_labels else north(0),
+        levels=levels,
+        probabilities=probabilities,
+        answer=model.answer(probabilities, missing, certainty),
+        not_in_map=missing,
+        in_map=model.is_in_map(missing, certainty),
+        radius_68_m=error_radius_m(levels, probabilities, 0.68),
+        radius_95_m=error_radius_m(levels, probabilities, 0.95),
+        match_probabilities=[],
+    )
+    told = estimate_place(given_, certainty, 0.33, "no place")
+    if pose_m is not None:
+        told = place_at_pose(told, pose(pose_m))
+    stated = [level.probability for level in told.levels]
+    assert stated == sorted(stated)
+    assert told.not_in_map_probability == pytest.approx(1 - stated[-1])
+    if told.answer_level is not None:
+        assert told.in_map
+        assert stated[told.answer_level] >= min(certainty, 0.95) - 1e-9
+        assert all(p < max(certainty, 0.95) for p in stated[: told.answer_level])
+    if told.in_map is False:
+        assert (told.latitude, told.place, told.radius_m, told.confidence) == (None,) * 4
+        assert told.answer_level is None
+        assert told.has_place is False
+        assert stated[-1] < 0.5
+        assert told.headline.startswith("Probably not in this map")
+    elif pose_m is not None and not of_labels:
+        assert (told.latitude, told.radius_m) == (POSE_LATITUDE, pose_m)
+        assert told.headline.startswith("Here, within")
+        assert told.in_map
+    else:
+        shown = told.levels[told.answer_level or 0]
+        assert (told.latitude, told.radius_m, told.place) == (
+            shown.latitude, shown.radius_m, shown.place,
+        )  # fmt: skip
+        assert told.confidence == shown.probability
+        assert told.headline.startswith("Not certain") is (told.answer_level is None)
+        assert ("In this map" in told.headline) is (
+            shown.whole_map and told.answer_level is not None
+        )
+
+
+POSE_LATITUDE = 45.00001
+
+
+def pose(radius_95_m: float) -> CameraPoseResponse:
+    fields = {"latitude": POSE_LATITUDE, "radius_68_m": radius_95_m / 2, "radius_95_m": radius_95_m}
+    return CameraPoseResponse.model_validate(POSE | fields)
 
 
 def test_an_empty_ranking_gives_no_estimate() -> None:
-    reported = answer(fitted(1.0))
+    reported = answer(fitted(-9.0))
     assert (reported.in_map, reported.latitude, reported.reason) == (None, None, "no place")
 
 
 def test_a_filter_does_not_hide_photos_of_other_places_from_the_probabilities() -> None:
-    alone = answer(fitted(1.0), EVERYTHING[0], whole_map=EVERYTHING)
-    last = answer(fitted(1.0), EVERYTHING[2], whole_map=EVERYTHING)
-    whole = answer(fitted(1.0), *EVERYTHING)
+    alone = answer(fitted(-9.0), EVERYTHING[0], whole_map=EVERYTHING)
+    last = answer(fitted(-9.0), EVERYTHING[2], whole_map=EVERYTHING)
+    whole = answer(fitted(-9.0), *EVERYTHING)
     assert alone.not_in_map_probability == whole.not_in_map_probability
     assert alone.confidence == whole.confidence
-    assert last.confidence is not None
-    assert alone.confidence is not None
-    assert last.confidence < alone.confidence
+    assert last.levels[0].probability < alone.levels[0].probability

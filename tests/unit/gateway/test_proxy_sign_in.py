@@ -90,21 +90,21 @@ def test_a_user_without_the_scope_gets_the_setting_that_grants_it(
 
 
 @pytest.mark.parametrize("peer", ["10.0.0.6", "::ffff:10.0.0.6", "127.0.0.1", "", None])
-def test_the_same_headers_from_anybody_else_are_ignored(
+def test_user_headers_of_untrusted_peers_are_ignored(
     sign_in: Authenticator, peer: str | None
 ) -> None:
     chief = (USER, ("X-Forwarded-Groups", "chiefs"), ("X-Forwarded-For", PROXY))
     assert code(sign_in, peer, *chief) == "key_missing"
 
 
-def test_a_key_counts_more_than_the_user(sign_in: Authenticator) -> None:
+def test_an_api_key_takes_precedence_over_the_user(sign_in: Authenticator) -> None:
     assert call(sign_in, PROXY, USER, ("Authorization", f"Bearer {KEY}")).identity == "admin"
     assert code(sign_in, PROXY, USER, ("Authorization", "Bearer wrong")) == "key_unknown"
     assert code(sign_in, PROXY) == "key_missing"
 
 
 @pytest.mark.parametrize("names", [("ada", "eve"), ("",), ("  ",), ("x" * 201,)])
-def test_a_name_that_is_not_one_name_is_refused(
+def test_a_repeated_empty_or_long_user_header_is_refused(
     sign_in: Authenticator, names: tuple[str, ...]
 ) -> None:
     headers = [("X-Forwarded-User", name) for name in names]

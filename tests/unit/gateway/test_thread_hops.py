@@ -14,7 +14,7 @@ from services.gateway.routes.uploads import router as uploads_router
 MAY_BLOCK = {ADMIT_JOB.dependency, ADMIT_QUERY.dependency}
 
 
-def test_an_upload_solves_no_dependency_in_another_thread_that_can_not_block() -> None:
+def test_dependencies_of_an_upload_that_do_not_block_run_on_the_event_loop() -> None:
     (route,) = (route for route in uploads_router.routes if isinstance(route, APIRoute))
     sync = {
         call

@@ -38,7 +38,7 @@ def policy(answer: httpx2.Response) -> dict[str, str]:
     return {name: value for name, _, value in (part.partition(" ") for part in parts)}
 
 
-def test_browsers_get_the_page_and_programs_what_this_is(page: TestClient) -> None:
+def test_the_root_answers_browsers_with_html_and_programs_with_json(page: TestClient) -> None:
     shown = page.get("/", headers=HTML)
     assert shown.headers["content-type"] == "text/html; charset=utf-8"
     assert "<title>Placewise</title>" in shown.text
@@ -57,7 +57,7 @@ def test_browsers_get_the_page_and_programs_what_this_is(page: TestClient) -> No
         ("mark.svg", "image/svg+xml"),
     ],
 )
-def test_files_have_their_type_and_are_small_on_the_way(
+def test_static_files_have_a_content_type_and_are_compressed(
     page: TestClient, path: str, media_type: str
 ) -> None:
     zipped = page.get(f"/console/{path}", headers={"Accept-Encoding": "gzip"})
@@ -68,7 +68,7 @@ def test_files_have_their_type_and_are_small_on_the_way(
     assert zipped.content == plain.content
 
 
-def test_a_browser_that_has_a_file_is_not_sent_it_again(page: TestClient) -> None:
+def test_an_unchanged_file_is_answered_with_304(page: TestClient) -> None:
     first = page.get("/console/app.js")
     again = page.get("/console/app.js", headers={"If-None-Match": first.headers["etag"]})
     assert (again.status_code, again.content) == (304, b"")
@@ -78,13 +78,15 @@ def test_a_browser_that_has_a_file_is_not_sent_it_again(page: TestClient) -> Non
 
 
 @pytest.mark.parametrize("path", ["nothing.js", "../app.py", "%2e%2e/__init__.py", "index.html"])
-def test_only_the_pages_own_files_are_sent(page: TestClient, path: str) -> None:
+def test_paths_outside_the_page_are_not_served(page: TestClient, path: str) -> None:
     answer = page.get(f"/console/{path}")
     assert answer.status_code == 404
     assert answer.json()["code"] == "path_not_found"
 
 
-def test_nothing_but_streets_may_be_loaded_from_another_server(page: TestClient) -> None:
+def test_the_content_security_policy_allows_only_map_tiles_of_another_server(
+    page: TestClient,
+) -> None:
     allowed = policy(page.get("/", headers=HTML))
     assert allowed["default-src"] == "'self'"
     assert allowed["img-src"] == "'self' blob: data: https://tile.openstreetmap.org"
@@ -93,7 +95,7 @@ def test_nothing_but_streets_may_be_loaded_from_another_server(page: TestClient)
         assert "script-src" not in policy(page.get(path)), "scripts are this server's alone"
 
 
-def test_without_streets_nothing_may_be_loaded_from_another_server(
+def test_the_content_security_policy_without_map_tiles_allows_no_other_server(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("MAP_TILES", "off")
@@ -111,7 +113,7 @@ def test_the_page_has_its_url_as_a_qr_code(page: TestClient) -> None:
         assert page.get("/console/qr.svg", params={"url": refused}).status_code == 422
 
 
-def test_the_tile_server_alone_is_added_to_what_may_be_loaded(
+def test_the_content_security_policy_names_the_tile_server(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("MAP_TILES", TILES)
@@ -142,7 +144,7 @@ def test_tiles_need_an_attribution_and_an_address_of_a_server_alone(
 
 
 @pytest.mark.parametrize("path", [path for path in SOURCES if path.suffix == ".html"])
-def test_pages_have_no_script_or_style_in_them(path: Path) -> None:
+def test_pages_have_no_inline_script_or_style(path: Path) -> None:
     text = path.read_text()
     assert not re.search(r"<style|\sstyle=|\son\w+=", text)
     assert all(tag.endswith("></script>") for tag in re.findall(r"<script.*?</script>", text))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import struct
 from pathlib import Path
@@ -71,9 +72,51 @@ def test_model_that_is_written_is_one_for_pycolmap_too(folder: Path, tmp_path: P
 
 
 def test_every_camera_model_has_the_number_of_parameters_that_pycolmap_says() -> None:
+    known = set(pycolmap.CameraModelId.__members__) - {"INVALID", "EQUIRECTANGULAR"}
+    assert known == {name for name, _ in CAMERA_MODELS.values()}
     for number, (name, parameters) in CAMERA_MODELS.items():
         camera = pycolmap.Camera.create_from_model_name(1, name, 100.0, 100, 80)
         assert (int(camera.model.value), len(camera.params)) == (number, parameters)
+
+
+def test_binary_files_are_read_where_stale_text_is_beside_them(model: Any, tmp_path: Path) -> None:
+    model.write_text(str(tmp_path))
+    text = tmp_path / "images.txt"
+    text.write_text(text.read_text().replace(NAMES[2], "stale.jpg"))
+    assert {photo.name for photo in read_colmap_model(tmp_path).photos} == {*NAMES[:2], "stale.jpg"}
+    model.write_binary(str(tmp_path))
+    (tmp_path / "points3D.bin").unlink()  # without which COLMAP would read the text
+    assert {photo.name for photo in read_colmap_model(tmp_path).photos} == set(NAMES)
+    (tmp_path / "images.bin").unlink()
+    assert "images.bin" in refused(tmp_path)
+
+
+def test_poses_of_rigs_are_those_of_their_cameras(tmp_path: Path) -> None:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 2, 3, 2
+    rigs = pycolmap.synthesize_dataset(options)
+    rigs.write_binary(str(tmp_path))
+    found = {photo.name: photo for photo in read_colmap_model(tmp_path).photos}
+    assert len(found) == 12
+    for image in rigs.images.values():
+        translation = image.cam_from_world().translation.tolist()
+        assert found[image.name].translation == pytest.approx(translation)
+
+
+@pytest.mark.parametrize("emptied", [{0}, {0, 1, 2}, {1}, {2}])
+def test_images_text_without_lines_of_points_is_refused(
+    model: Any, tmp_path: Path, emptied: set[int]
+) -> None:
+    """COLMAP takes each second line for points, and so would lose every second photo."""
+    model.write_text(str(tmp_path))
+    path = tmp_path / "images.txt"
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+    photos = [[pose] + [""] * (n not in emptied) for n, pose in enumerate(lines[::2])]
+    path.write_text("# no points\n" + "\n".join(line for photo in photos for line in photo) + "\n")
+    if emptied == {2}:
+        assert len(read_colmap_model(tmp_path).photos) == 3
+    else:
+        assert "is not its list of points" in refused(tmp_path)
 
 
 def test_renamed_images_keep_everything_else(model: Any, tmp_path: Path) -> None:
@@ -115,7 +158,9 @@ def test_camera_of_an_unknown_model_is_refused(folder: Path, tmp_path: Path) -> 
     assert "99" in refused(tmp_path) or "PERIDOT" in refused(tmp_path)
 
 
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(data=st.data())
 def test_damaged_files_are_read_or_refused_and_nothing_else(
     folder: Path, tmp_path: Path, data: st.DataObject
@@ -128,3 +173,20 @@ def test_damaged_files_are_read_or_refused_and_nothing_else(
     (tmp_path / name).write_bytes(content)
     with contextlib.suppress(InvalidRequest):
         read_colmap_model(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["fifo", "endless device", "folder"])
+def test_what_is_no_regular_file_is_not_read(folder: Path, tmp_path: Path, kind: str) -> None:
+    for name in ("cameras", "images"):
+        model = shutil.copytree(folder, tmp_path / name)
+        file = next(model.glob(f"{name}.*"))
+        file.unlink()
+        if kind == "fifo":
+            os.mkfifo(file)
+        elif kind == "folder":
+            file.mkdir()
+        else:
+            file.symlink_to("/dev/zero")
+        with pytest.raises(InvalidRequest) as caught:
+            read_colmap_model(model)
+        assert caught.value.code == "bad_colmap_model"

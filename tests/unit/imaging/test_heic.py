@@ -141,7 +141,7 @@ def test_what_only_begins_like_a_heic_is_refused(data: bytes, why: str) -> None:
     assert why in caught.value.detail
 
 
-def test_exif_behind_an_item_of_several_extents_is_read_and_exif_of_several_left_out() -> None:
+def test_exif_behind_an_item_of_several_extents_is_read_and_so_is_exif_in_several() -> None:
     exif = b"\0\0\0\6" + taken_in_turin()
     at = 1000
     iloc = struct.pack(">HHH", 1, 0, 3) + bytes(24) + struct.pack(">HHHII", 2, 0, 1, at, len(exif))
@@ -149,9 +149,12 @@ def test_exif_behind_an_item_of_several_extents_is_read_and_exif_of_several_left
     header = read_photo_header(io.BytesIO(data), PIXELS)
     assert (header.width, header.height) == (320, 200)
     assert header.latitude == pytest.approx(45.07)
-    several = hostile_headers.heic(struct.pack(">HHH", 2, 0, 65_535))
-    header = read_photo_header(io.BytesIO(several), PIXELS)
-    assert (header.width, header.latitude) == (320, None)
+    parts = struct.pack(">HHHIIII", 2, 0, 2, at, 100, at + 200, len(exif) - 100)
+    data = hostile_headers.heic(parts).ljust(at, b"\0") + exif[:100] + bytes(100) + exif[100:]
+    assert read_photo_header(io.BytesIO(data), PIXELS).latitude == pytest.approx(45.07)
+    elsewhere = hostile_headers.heic(struct.pack(">HHHII", 2, 7, 1, at, len(exif))) + data[-1000:]
+    error = "its EXIF is damaged, or larger than 1 MB"
+    assert read_photo_header(io.BytesIO(elsewhere), PIXELS).gps_error == error
 
 
 def test_no_damage_to_a_header_is_more_than_a_refusal() -> None:

@@ -101,10 +101,16 @@ def test_coordinates_that_are_none_are_refused() -> None:
         assert refused_field({"latitude": "0", "longitude": value}) == "longitude"
 
 
-@pytest.mark.parametrize(("latitude", "longitude"), [("90", "180"), ("-90", "-180"), ("0", "0")])
+@pytest.mark.parametrize(("latitude", "longitude"), [("90", "180"), ("-90", "-180"), ("0", "7")])
 def test_ends_of_the_ranges_are_places(latitude: str, longitude: str) -> None:
     found = read_form_fields({"latitude": latitude, "longitude": longitude})
     assert (found.latitude, found.longitude) == (float(latitude), float(longitude))
+
+
+@pytest.mark.parametrize("zero", ["0", "0.0", "-0.000", "0e5"])
+def test_null_island_is_no_place(zero: str) -> None:
+    found = read_form_fields({"latitude": zero, "longitude": zero})
+    assert (found.latitude, found.longitude) == (None, None)
 
 
 def test_coordinates_come_in_pairs() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from fractions import Fraction
 from typing import Any
 from uuid import UUID
@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from services.search import dense_scan
-from services.search.chunk_loader import LoadedChunk
-from services.search.dense_scan import FLOAT32_MARGIN
+from services.search.dense_scan import float32_error
 from services.search.exact_rerank import RowBlocks
 from services.search.executor import SearchOptions
 from services.search.photo_columns import build_row_mask
@@ -68,7 +67,7 @@ def scan(
     duplicates=st.integers(0, 20),
     nearly=st.booleans(),
     row_type=st.sampled_from([np.float32, np.float16]),
-    numpy_numbers=st.sampled_from([0, dense_scan.NUMPY_FLOAT16_NUMBERS]),
+    numpy_numbers=st.sampled_from([0, dense_scan.NUMPY_NUMBERS]),
     data=st.data(),
 )
 def test_answers_equal_brute_force_with_order_and_ties(
@@ -100,7 +99,7 @@ def test_answers_equal_brute_force_with_order_and_ties(
     live = np.array([number not in dead for number in numbers])
     exact = dict(brute_force(stored, query, count, live, numbers=numbers))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dense_scan, "NUMPY_FLOAT16_NUMBERS", numpy_numbers)
+        patch.setattr(dense_scan, "NUMPY_NUMBERS", numpy_numbers)
         found = scan(snapshot, query, k)
     assert_best(hits_of(found), exact, k)
     assert found.certificate == "exhaustive"
@@ -111,28 +110,25 @@ def test_answers_equal_brute_force_with_order_and_ties(
 def test_the_kernel_is_compiled_in_advance_exactly_for_maps_that_use_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    cosines = dense_scan._kernel_cosines
-    used: list[int] = []
+    used: set[type[Any]] = set()
+    multiply = RowBlocks.multiply
 
-    def record(chunks: Sequence[LoadedChunk], query: Rows, rows: NDArray[np.int64]) -> Any:
-        used.append(len(rows))
-        return cosines(chunks, query, rows)
+    def record(blocks: RowBlocks, rows: Any, query: Rows, out: Any) -> None:
+        used.add(out.dtype.type)
+        multiply(blocks, rows, query, out)
 
-    monkeypatch.setattr(dense_scan, "_kernel_cosines", record)
+    monkeypatch.setattr(RowBlocks, "multiply", record)
     rows = unit_rows(6, 80, 14_336)
-    cases: list[tuple[StoredRows, bool]] = [
-        (rows.astype(np.float16), True),
-        (rows[:60].astype(np.float16), False),
-        (rows, False),
-    ]
-    for stored, uses in cases:
-        used.clear()
-        count = len(stored)
-        snapshot = snapshot_of(stored, 1, coded=False)
-        dense_scan.compile_kernel(snapshot.chunks)
-        assert used == [1] * uses
-        scan(snapshot, rows[0], 5)
-        assert used == [1, count] * uses
+    row_types: tuple[Any, ...] = (np.float16, np.float32)
+    for row_type in row_types:
+        for count, kinds in ((80, {np.float32, np.float64}), (60, set())):
+            used.clear()
+            stored: StoredRows = rows[:count].astype(row_type)
+            snapshot = snapshot_of(stored, 1, coded=False)
+            dense_scan.compile_kernel(snapshot)
+            assert used == kinds
+            scan(snapshot, rows[0], 5)
+            assert used == kinds
 
 
 def test_chunks_of_both_types_are_searched_as_one_map() -> None:
@@ -180,11 +176,39 @@ def test_scores_equal_exact_arithmetic() -> None:
         assert score == pytest.approx(float(sum(products)) / length, abs=1e-12)
 
 
-def test_margin_covers_what_float32_sums_err_at_98304_dimensions() -> None:
-    rows = unit_rows(3, 12, 98_304)
-    query = normalised(rows[:1] + unit_rows(4, 1, 98_304) * np.float32(0.1))[0]
+@pytest.mark.parametrize("dimension", [1, 4096, 98_304])
+def test_the_error_bound_covers_float32_sums_in_the_worst_order(dimension: int) -> None:
+    """From the largest product to the smallest, none of them negative: each sum rounds."""
+    rng = np.random.default_rng(dimension)
+    products = np.sort(rng.exponential(size=(8, dimension)).astype(np.float32), axis=1)[:, ::-1]
+    rows = normalised(np.sqrt(products)).astype(np.float16)
+    query = normalised(np.sqrt(products[0]))
     exact = rows.astype(np.float64) @ query.astype(np.float64)
-    assert np.abs(rows @ query - exact).max() < FLOAT32_MARGIN / 4
+    in_order = np.cumsum(rows.astype(np.float32) * query, axis=1, dtype=np.float32)[:, -1]
+    error = np.abs(in_order - exact).max()
+    assert error < float32_error(dimension)
+    assert dimension == 1 or error > float32_error(dimension) / 1000
+
+
+def test_a_row_that_float32_sums_rank_too_low_is_found() -> None:
+    """The product of the best row loses half of its numbers to rounding, the other's none."""
+    dimension = 4097
+    best = np.full(dimension, 2.0**-12.5, np.float32)
+    best[0] = 1.0
+    other = np.zeros(dimension, np.float32)
+    other[0], other[1] = 1.0, 2.0**-11
+    query = best
+    snapshot = snapshot_of(np.stack([other, best]), 1, coded=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dense_scan, "_multiply", summed_in_order)
+        assert hits_of(scan(snapshot, query, 1))[0][0] == photo(1)
+        patch.setattr(dense_scan, "float32_error", lambda dimension: 0.0)
+        assert hits_of(scan(snapshot, query, 1))[0][0] == photo(0)
+
+
+def summed_in_order(snapshot: Snapshot, rows: Any, query: Rows, kind: Any) -> Any:
+    stored = np.concatenate([chunk.rows for chunk in snapshot.chunks])[rows].astype(kind)
+    return np.cumsum(stored * query.astype(kind), axis=1, dtype=kind)[:, -1]
 
 
 def test_excluded_photos_make_room_for_the_next() -> None:

@@ -36,15 +36,6 @@ def answer(*hits: tuple[int, float], **changes: Any) -> SearchResponse:
     )
 
 
-def weighted(*hits: tuple[int, float, float], **changes: Any) -> SearchResponse:
-    """`hits` are (photo, score, weighted score), in the order of the last."""
-    found = tuple(
-        SearchHit(photo_id=UUID(int=number), score=score, weighted_score=by)
-        for number, score, by in hits
-    )
-    return answer(**changes).model_copy(update={"hits": found})
-
-
 def ranked(response: SearchResponse) -> list[tuple[int, float]]:
     return [(hit.photo_id.int, hit.score) for hit in response.hits]
 
@@ -63,11 +54,6 @@ def test_the_merged_order_is_that_of_one_list_also_for_equal_scores(
     merged = merge_responses([answer(*hits) for hits in shards], k)
     whole = sorted(enumerate(scores), key=lambda hit: (-hit[1], hit[0]))
     assert ranked(merged) == whole[:k]
-
-
-def test_what_was_ranked_by_weighted_scores_is_merged_by_them_ties_by_photo() -> None:
-    shards = [weighted((4, 0.1, 0.9), (1, 0.8, 0.3)), weighted((3, 0.2, 0.9), (2, 0.9, 0.5))]
-    assert ranked(merge_responses(shards, k=3)) == [(3, 0.2), (4, 0.1), (2, 0.9)]
 
 
 def test_a_photo_that_two_shards_have_for_a_moment_is_answered_once() -> None:

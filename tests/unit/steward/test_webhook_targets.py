@@ -21,7 +21,7 @@ from shared.security.webhook_targets import (
 @pytest.mark.parametrize(
     "address", ["8.8.8.8", "1.1.1.1", "2606:4700:4700::1111", "64:ff9b::808:808"]
 )
-def test_machines_of_the_internet_may_be_called(address: str) -> None:
+def test_public_addresses_are_allowed(address: str) -> None:
     assert is_public_address(ipaddress.ip_address(address))
 
 
@@ -62,7 +62,7 @@ def test_machines_of_the_internet_may_be_called(address: str) -> None:
         "::127.0.0.1",
     ],
 )
-def test_no_machine_of_our_own_may_be_called_however_it_is_written(address: str) -> None:
+def test_private_addresses_are_refused_in_every_notation(address: str) -> None:
     assert not is_public_address(ipaddress.ip_address(address))
 
 
@@ -78,7 +78,7 @@ def test_spellings_of_loopback_are_loopback(host: str) -> None:
     assert resolve_webhook_target(target, allow_private=True) in ("127.0.0.1", "::1", "0.0.0.0")
 
 
-def test_a_name_with_one_private_address_is_refused_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_host_with_one_private_address_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     def both(host: str, port: int, **options: Any) -> Any:
         return [
             (socket.AF_INET, socket.SOCK_STREAM, 6, "", (address, port))
@@ -92,7 +92,7 @@ def test_a_name_with_one_private_address_is_refused_whole(monkeypatch: pytest.Mo
         )
 
 
-def test_a_name_without_an_address_differs_from_a_forbidden_one() -> None:
+def test_an_unresolvable_host_differs_from_a_private_one() -> None:
     with pytest.raises(PlacewiseError) as caught:
         resolve_webhook_target(
             WebhookTarget("https", "no-such-name.invalid", 443, "/"), allow_private=False
@@ -123,7 +123,7 @@ def test_a_name_without_an_address_differs_from_a_forbidden_one() -> None:
         "https://example.com/" + "x" * 2000,
     ],
 )
-def test_what_is_no_address_of_a_webhook_is_refused(url: str) -> None:
+def test_invalid_webhook_urls_are_refused(url: str) -> None:
     with pytest.raises(Unprocessable) as caught:
         parse_webhook_url(url, allow_private=False)
     assert caught.value.code == "invalid_field"

@@ -236,7 +236,7 @@ def test_one_row_is_read_without_the_others(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["cut", "other"])
-def test_a_row_of_a_damaged_object_is_not_made_up(store: FolderStore, damage: str) -> None:
+def test_a_row_of_a_damaged_object_is_an_error(store: FolderStore, damage: str) -> None:
     rows = some_rows()
     chunk = written(store, rows, [new_id() for _ in rows])
     whole = store.get(chunk.object_key)
@@ -277,3 +277,23 @@ def test_norms_of_float16_rows_are_summed_more_precisely_than_they_are_stored() 
     rows = some_rows(2, 98_304)
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
     assert rows_are_valid(rows.astype(np.float16)).all()
+
+
+def test_the_local_features_of_another_chunk_are_recognised(store: FolderStore) -> None:
+    features = FeatureRows("test@1", [b"first", b"second"])
+    mine, other = (
+        write_chunk(
+            store,
+            generation_id=GENERATION,
+            chunk_id=new_id(),
+            rows=some_rows(2),
+            photo_ids=[new_id(), new_id()],
+            spec={},
+            features=features,
+        )
+        for _ in range(2)
+    )
+    store.put(features_key(mine.object_key), store.get(features_key(other.object_key)))
+    with pytest.raises(ValueError, match=features_key(other.object_key).rpartition("/")[2]):
+        read_feature_index(store, features_key(mine.object_key))
+    assert read_feature_index(store, features_key(other.object_key)).rows == 2

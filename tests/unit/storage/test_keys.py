@@ -47,5 +47,5 @@ def test_an_original_has_the_ending_of_its_file_if_it_is_a_photos(
         f"{OURS}/a.jpg",
     ],
 )
-def test_other_files_in_the_folder_of_the_originals_are_not_ours(name: str) -> None:
+def test_foreign_files_in_the_folder_of_originals_are_no_originals(name: str) -> None:
     assert not is_original_key(f"originals/{name}")

@@ -26,7 +26,7 @@ def belief(**changes: object) -> Belief:
     return Belief(**(values | changes))  # type: ignore[arg-type]
 
 
-def test_a_belief_is_read_as_it_was_written() -> None:
+def test_a_belief_survives_serialisation() -> None:
     restored = Belief.from_bytes(belief(status="tracking", frames=3).to_bytes())
     assert (restored.time, restored.photos) == (at(0), ("a", "b"))
     assert restored.probabilities.tolist() == [0.5, 0.25]
@@ -46,7 +46,7 @@ def test_a_belief_is_read_as_it_was_written() -> None:
     ],
     ids=["empty", "damaged", "no version", "a list", "too long", "more than 1"],
 )
-def test_bytes_that_are_no_belief_are_an_error(data: bytes) -> None:
+def test_malformed_beliefs_are_an_error(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"belief|Belief"):
         Belief.from_bytes(data)
 
@@ -84,7 +84,7 @@ def test_equal_scores_say_nothing_about_the_hits() -> None:
     assert rank_shares(np.zeros(0), 10)[1] == 1.0
 
 
-def test_evidence_is_read_as_it_was_written() -> None:
+def test_evidence_survives_serialisation() -> None:
     evidence = frame_evidence(at(0), ["a"], [0.9], 10)
     assert FrameEvidence.model_validate_json(evidence.model_dump_json()) == evidence
     of_an_earlier_release = evidence.model_dump(mode="json") | {"not_in_map": 0.02}

@@ -152,7 +152,7 @@ def test_frames_that_follow_the_street_are_tracked_with_their_position_and_headi
     assert state.radius_68_m <= 25.0
 
 
-def test_a_camera_that_was_carried_away_is_found_again() -> None:
+def test_a_kidnapped_camera_is_relocalised() -> None:
     track_filter, belief = TrackFilter(line_map(500), motion_model(15.0)), None
     for step in range(20):
         belief = track_filter.advance(belief, pointing_at(50 + step, 500, step, 0.3))

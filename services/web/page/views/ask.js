@@ -95,9 +95,30 @@ function askEntry(map, onfile, signal) {
   return zone;
 }
 
+const PIXELS = { PNG: ["IDAT"], WEBP: ["VP8 ", "VP8L", "ALPH", "ANMF"] };
+
+/** The part of a photo's file with its metadata: of a PNG or WebP all but the pixels, which metadata
+ * may follow; of others the beginning. */
+async function withoutPixels(file) {
+  const read = async (begin, size) => new DataView(await file.slice(begin, begin + size).arrayBuffer());
+  const letters = (view, begin) => String.fromCharCode(...new Uint8Array(view.buffer, begin, 4));
+  const head = file.size < 16 ? null : await read(0, 16);
+  const isPng = head?.getUint32(0) === 0x89504e47;
+  const kept = [];
+  if (!isPng && !(head && letters(head, 0) === "RIFF" && letters(head, 8) === "WEBP" && letters(head, 12) === "VP8X")) return file.slice(0, HEADER_BYTES);
+  for (let begin = isPng ? 8 : 12; begin + 8 <= file.size;) {
+    const chunk = await read(begin, 8);
+    const size = isPng ? 12 + chunk.getUint32(0) : 8 + 2 * Math.ceil(chunk.getUint32(4, true) / 2);
+    if (!PIXELS[isPng ? "PNG" : "WEBP"].includes(letters(chunk, isPng ? 4 : 0))) kept.push(file.slice(begin, begin + size));
+    begin += size;
+  }
+  const bytes = new Uint32Array([4 + kept.reduce((all, { size }) => all + size, 0)]); // of a RIFF's content
+  return new Blob([...(isPng ? [file.slice(0, 8)] : [file.slice(0, 4), bytes, file.slice(8, 12)]), ...kept]);
+}
+
 /** What the header of a photo's file says. */
 export async function readHeader(file, signal) {
-  const response = await ask("/photo-headers", { method: "POST", body: file.slice(0, HEADER_BYTES), headers: { "Content-Type": "application/octet-stream" }, signal });
+  const response = await ask("/photo-headers", { method: "POST", body: await withoutPixels(file), headers: { "Content-Type": "application/octet-stream" }, signal });
   return response.json();
 }
 
@@ -159,7 +180,7 @@ async function showAnswer(answer, queryPhoto, signal) {
     h("section", {},
       h("h2", { class: "matches-title" }, photos.length ? "Most similar photos" : "No photo found"),
       h("ol", { class: "matches" }, photos.map((photo, index) => h("li", {}, matchCard(photo, index, () => open(index))))),
-      photos.length > 0 && figures(photos, found.word_weights === "applied")));
+      photos.length > 0 && figures(photos)));
   if (measurement) {
     const askAgain = () => showAnswer(answer, queryPhoto, signal);
     followMeasurement(measurement, map, askAgain, () => mine === questions && answer.isConnected, signal);
@@ -224,15 +245,15 @@ function matchCard(photo, index, onclick) {
 }
 
 /** The numbers behind the ranking. */
-function figures(photos, weighted) {
+function figures(photos) {
   const likely = photos.some(hasProbability);
   const order = likely
-    ? `Photos are in the order of the probability that they show the same place. It is computed from all similarities${weighted ? ", with word weights" : ""}. A match is strong from 80 %, fair from 30 %, and weak below. Photos without coordinates or a label keep their place in the order of similarity.`
+    ? `Photos are in the order of the probability that they show the same place. It is computed from all similarities. A match is strong from 80 %, fair from 30 %, and weak below. Photos without coordinates or a label keep their place in the order of similarity.`
     : "Photos are in the order of their similarity.";
   const matched = photos.some((photo) => photo.inliers !== null);
-  const heads = ["", "Photo", ...(likely ? ["Same place"] : []), ...(weighted ? ["Weighted score"] : []), ...(matched ? ["Matching points"] : []), "Similarity"];
+  const heads = ["", "Photo", ...(likely ? ["Same place"] : []), ...(matched ? ["Matching points"] : []), "Similarity"];
   const numbers = (photo) => [
-    ...(likely ? [percent(photo.match_probability)] : []), ...(weighted ? [score(photo.weighted_score)] : []), ...(matched ? [photo.inliers === null ? "–" : count(photo.inliers)] : []), score(photo.similarity_score),
+    ...(likely ? [percent(photo.match_probability)] : []), ...(matched ? [photo.inliers === null ? "–" : count(photo.inliers)] : []), score(photo.similarity_score),
   ];
   return h("details", { class: "card figures" }, h("summary", {}, "Details"),
     h("p", { class: "soft" }, `${order} Similarity is the cosine of two descriptors.`),

@@ -36,7 +36,7 @@ export function compare(queryPhoto, { matches }, photos, index, signal) {
       h("div", { class: "compare-words" },
         h("div", {},
           photo.match_probability !== null && h("p", {}, h("span", { class: `strength ${strength(photo.match_probability)}` }, strength(photo.match_probability)), h("span", { class: "figure large" }, ` ${percent(photo.match_probability)}`), h("span", { class: "soft" }, " the same place")),
-          h("details", {}, h("summary", {}, "Details"), h("p", { class: "soft" }, `Similarity ${score(photo.similarity_score)} (cosine)`, photo.weighted_score !== null && `, weighted score ${score(photo.weighted_score)}`))),
+          h("details", {}, h("summary", {}, "Details"), h("p", { class: "soft" }, `Similarity ${score(photo.similarity_score)} (cosine)`))),
         h("p", { class: "points", role: "status" }, points),
         h("div", { class: "row end" },
           h("button", { type: "button", onclick: () => show(index - 1) }, "← Previous"),

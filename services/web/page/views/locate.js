@@ -12,7 +12,7 @@ const WITH_COORDINATES = "-90,-180,90,180"; // a box around all photos with coor
 const AT_ONCE = 3;
 const PER_CALL = 100; // photos without coordinates, as the server allows
 const TRACK_POINTS = 5000;
-const PHOTO = /\.(jpe?g|png|webp|bmp|tiff?|heic|heif)$/i;
+const PHOTO = /\.(jpe?g|jpe|jfif|png|webp|bmp|tiff?|heic|heif)$/i;
 const OWN_ZONE = Intl.DateTimeFormat().resolvedOptions().timeZone;
 
 export async function showLocate(view, { signal }) {
@@ -38,6 +38,8 @@ export async function showLocate(view, { signal }) {
   const take = async (chosenFiles) => {
     const files = withoutHidden(chosenFiles);
     const tracks = files.filter(({ path }) => /\.gpx$/i.test(path));
+    const sidecars = files.filter(({ path }) => /\.xmp$/i.test(path)).length;
+    if (sidecars) note(`${plural(sidecars, "sidecar")} (XMP) not read here: run placewise locate.`);
     if (tracks.length) track = [];
     for (const { file } of tracks) track.push(...readTrack(await file.text(), file.name));
     const chosen = files.filter(({ path }) => PHOTO.test(path));
@@ -105,7 +107,7 @@ async function readPhotos(files, map, progress, signal) {
   };
   try {
     await step("Reading times and coordinates", photos, (photo) => readHeader(photo, signal));
-    await step("Looking for similar photos", photos.filter((photo) => photo.latitude === null && !photo.error), (photo) => search(photo, map, signal));
+    await step("Looking for similar photos", photos.filter((photo) => photo.latitude === null && !photo.error && !photo.unread), (photo) => search(photo, map, signal));
   } finally {
     fill(progress);
   }
@@ -117,19 +119,21 @@ async function readHeader(photo, signal) {
     photo.error = "The file is empty.";
     return;
   }
-  const { captured_at: time, time_zone_is_known: zoned, focal_length: focal, ...header } = await headerOf(photo.file, signal);
-  Object.assign(photo, header, { clock: time && { time: Date.parse(time), zoned }, focal });
+  const { captured_at: time, time_zone_is_known: zoned, focal_length: focal, gps_error: unread, ...header } = await headerOf(photo.file, signal);
+  Object.assign(photo, header, { clock: time && { time: Date.parse(time), zoned }, focal, unread });
 }
 
-/** Set `captured_at` by the cameras' clocks: those without a time zone show that of `zone`, and those
- * of photos without coordinates are `ahead` by so many seconds. */
+/** Set `captured_at` by the cameras' clocks: those without a time zone, which no GPS time of the camera
+ * shows to the server, show that of `zone`, and those of photos without coordinates are `ahead` by so
+ * many seconds. */
 function setTimes(photos, zone, ahead) {
+  const known = new Set(photos.filter(({ clock_offset: offset }) => offset).map(({ camera }) => camera));
   const unlocated = new Set(photos.filter(({ latitude }) => latitude === null).map(({ camera }) => camera));
   for (const photo of photos.filter(({ clock }) => clock)) {
     const { time, zoned } = photo.clock;
     const seconds = unlocated.has(photo.camera) ? ahead : 0;
-    photo.captured_at = new Date((zoned ? time : toUtc(time, zone)) - 1000 * seconds).toISOString();
-    photo.time_zone_is_known = true;
+    photo.time_zone_is_known = zoned || !photo.camera || !known.has(photo.camera);
+    photo.captured_at = new Date((zoned || !photo.time_zone_is_known ? time : toUtc(time, zone)) - 1000 * seconds).toISOString();
   }
 }
 
@@ -149,7 +153,7 @@ async function search(photo, map, signal) {
   const { similar_images: similar } = found.matches_without_place ? await find({ box: WITH_COORDINATES }) : found;
   const { estimate, pose } = found;
   photo.search = {
-    similar: similar.filter(({ latitude }) => latitude !== null).map((match) => ({ name: nameOf(match), latitude: match.latitude, longitude: match.longitude, score: match.weighted_score ?? match.similarity_score })),
+    similar: similar.filter(({ latitude }) => latitude !== null).map((match) => ({ name: nameOf(match), latitude: match.latitude, longitude: match.longitude, score: match.similarity_score })),
     circles: estimate.levels.filter(({ radius_m: radius }) => radius !== null).map(({ latitude, longitude, radius_m, probability }) => ({ latitude, longitude, radius_m, probability })),
     not_in_map: estimate.not_in_map_probability ?? 0.02,
     pose: pose?.radius_68_m == null ? null : { latitude: pose.latitude, longitude: pose.longitude, radius_68_m: pose.radius_68_m, heading: pose.heading },
@@ -170,7 +174,7 @@ function readTrack(text, name) {
 }
 
 async function proposePositions(photos, track, options, signal) {
-  const sent = photos.map(({ file, error, clock, focal, ...photo }) => photo);
+  const sent = photos.filter(({ unread }) => !unread).map(({ file, error, clock, focal, unread, ...photo }) => photo);
   const located = sent.filter(({ latitude }) => latitude !== null);
   const others = sent.filter(({ latitude }) => latitude === null);
   const proposals = [];
@@ -205,6 +209,7 @@ async function drawResult(result, photos, proposals, least, signal) {
         h("div", { class: "row" },
           accepted.length > 0 && button("Download CSV", () => download("placewise-locations.csv", "text/csv", csvOf(accepted)), "primary"),
           accepted.length > 0 && button("Download GPX", () => download("placewise-locations.gpx", "application/gpx+xml", gpxOf(accepted, photos))))),
+      photos.some(({ unread }) => unread) && h("p", { class: "hint" }, `${plural(photos.filter(({ unread }) => unread).length, "photo")} with a GPS tag that could not be read, left out: `, photos.filter(({ unread }) => unread).map(({ name, unread }) => `${name} (${unread})`).join(", ")),
       h("p", { class: "soft small" }, `${plural(located.length, "photo")} with coordinates. To write into photos or sidecars, run `, h("code", {}, "placewise locate"), "."),
       h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Proposals" }, h("table", { class: "stacked" },
         h("thead", {}, h("tr", {}, ["Photo", "Position", "Probability", "", "Reason"].map((name) => h("th", { scope: "col", class: name === "Probability" ? "number" : "" }, name || h("span", { class: "visually-hidden" }, "Accepted"))))),

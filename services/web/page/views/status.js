@@ -69,7 +69,7 @@ function drawFigures(card, stats, map, failed, look) {
 }
 
 // Those that a search starts are listed as questions.
-const KINDS = ["index", "batch", "fit", "import_vocabulary", "switch", "pca", "add_model", "reconstruct", "evaluate", "word_weights"];
+const KINDS = ["index", "batch", "fit", "import_vocabulary", "switch", "pca", "add_model", "reconstruct", "evaluate"];
 
 function drawJobs(card, jobs, look) {
   if (!jobs.length) {
@@ -79,7 +79,7 @@ function drawJobs(card, jobs, look) {
   fill(card, h("h2", {}, "Newest jobs"), h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Newest jobs" }, h("table", {},
     h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Job"), h("th", { scope: "col" }, "State"), h("th", { scope: "col", class: "number wide-only" }, "Done"), h("th", { scope: "col" }, "Begun"), h("th", { scope: "col" }, h("span", { class: "visually-hidden" }, "What can be done")))),
     h("tbody", {}, jobs.map((job) => h("tr", {},
-      h("td", {}, job.file_id ? h("a", { href: `#/photo/${job.file_id}` }, job.label) : job.label),
+      h("td", {}, job.file_id ? h("a", { href: `#/photo/${job.file_id}` }, job.filename ?? job.label) : job.filename ?? job.label, job.filename && h("p", { class: "soft small" }, job.label)),
       h("td", {}, h("span", { class: `chip ${job.state}` }, stateInWords(job)), job.error && h("p", { class: "bad small" }, job.error.detail)),
       h("td", { class: "number wide-only" }, job.progress.total ? `${count(job.progress.done)} / ${count(job.progress.total)}` : "–"),
       h("td", {}, time(job.created_at)),
@@ -118,7 +118,7 @@ function phoneCard({ lan_url: lanUrl }) {
       ? h("div", { class: "phone-address" },
         h("img", { src: `/console/qr.svg?url=${encodeURIComponent(url)}`, alt: `QR code of ${url}`, width: "180", height: "180" }),
         h("div", {}, h("p", {}, "Scan this code with the camera of a phone in the same network, or open ", h("a", { href: url }, url), " there."), h("p", { class: "soft" }, "The phone asks for the key once, and can remember it.")))
-      : h("p", {}, "Only this machine can reach this server. To use it from a phone, start it with ", h("code", {}, "make run HOST=0.0.0.0"), ". Every call then needs a key, which the first start prints."),
+      : h("p", {}, "Only this machine can reach this server. To use it from a phone, start it for the network: ", h("code", {}, "make run HOST=0.0.0.0"), ", or with Docker Compose ", h("code", {}, "BIND=0.0.0.0"), ". Every call then needs a key."),
     hasKey() && h("p", { class: "row" }, "This browser has a key. ", button("Forget the key", () => {
       forgetKey();
       location.reload();

@@ -7,7 +7,6 @@ import { coordinateTools } from "../places.js";
 import { poseInWords } from "./pose.js";
 
 const RINGS = [[0.95, "radius_95_m", "ring-95"], [0.68, "radius_68_m", "ring-68"]];
-const MOST_SURE = 99;
 
 /** The card with the estimate of a similarity search; `measurement` is an element with `measurementInWords`, null for an estimate with probabilities. */
 export function verdict(found, measurement) {
@@ -17,17 +16,18 @@ export function verdict(found, measurement) {
   const bars = estimate.levels.length > 0 && shares(estimate);
   return h("div", { class: `verdict ${kind}` },
     h("p", { class: "badge" }, title),
+    h("p", { class: "headline" }, estimate.headline),
     kind === "unknown" ? null : whereabouts(estimate),
     poseInWords(found.pose),
-    measurement ?? h("p", { class: "reason" }, bars ? reason(estimate, kind, bars) : estimate.reason),
+    measurement ?? h("p", { class: "reason" }, estimate.reason),
     without > 0 && without < found.total_similar && h("p", { class: "soft" }, `${count(without)} of these ${plural(found.total_similar, "photo")} ${without === 1 ? "has" : "have"} neither coordinates nor a label. The estimate is that of the photos that have.`),
     bars && kind !== "unknown" && [drawBars(bars), ringsInWords(estimate)],
     source(estimate),
     h("details", {}, h("summary", {}, "Details"),
       h("dl", { class: "facts" },
-        bars && kind !== "unknown" && [h("dt", {}, "Not in this map"), h("dd", {}, percent(estimate.not_in_map_probability))],
+        bars && [h("dt", {}, "Not in this map"), h("dd", {}, percent(estimate.not_in_map_probability))],
         h("dt", {}, "Compared"), h("dd", {}, `${count(found.rows_scanned)} rows, ${found.certificate}`),
-        h("dt", {}, "Ranked by"), h("dd", {}, found.word_weights === "applied" ? "similarity, with word weights" : "similarity"),
+        h("dt", {}, "Ranked by"), h("dd", {}, "similarity"),
         h("dt", {}, "Took"), h("dd", {}, `${found.processing_time_ms.toFixed(0)} ms`),
         (found.no_pose ?? found.pose?.reason) && [h("dt", {}, "Pose"), h("dd", {}, found.no_pose ?? found.pose.reason)],
         h("dt", {}, "Vocabulary"), h("dd", {}, found.vocabulary))),
@@ -46,13 +46,11 @@ export function drawRings(map, estimate) {
   }
 }
 
-/** The style and the title of an estimate, or of an entry of the search history. Without levels there is no probability of “not in this map”. */
-export function judge({ answer_level: answer, not_in_map_probability: outside, in_map: accepted, has_place: hasPlace }) {
-  const hasLevels = outside !== null;
-  if (hasLevels ? answer !== null : accepted) return ["known", "In this map"];
-  if (outside > 0.5) return ["unknown", "Not in this map"];
-  if (hasPlace) return ["open", "Best guess"];
-  return accepted === false ? ["unknown", "Probably not in this map"] : ["open", "No estimate"];
+/** The style and the title of an estimate, or of an entry of the search history. */
+export function judge({ in_map: inMap, has_place: hasPlace }) {
+  if (inMap) return ["known", "In this map"];
+  if (inMap === false) return ["unknown", "Not in this map"];
+  return hasPlace ? ["open", "Best guess"] : ["open", "No estimate"];
 }
 
 /** Whether it is known how certain the map's answers are; `onchange` is called when that may have changed. */
@@ -66,37 +64,25 @@ export function measurementInWords({ measurement, located }, onchange) {
   }
 }
 
-/** The estimated place. Its error is the widest ring of the map that is known, so that both agree. */
-function whereabouts(estimate) {
-  const [share, ring] = RINGS.find(([, radius]) => estimate[radius] !== null) ?? [];
-  const { place, latitude, longitude } = estimate.levels[ring ? 0 : estimate.answer_level ?? 0] ?? estimate;
+/** The place that the headline speaks of. */
+function whereabouts({ place, latitude, longitude }) {
   return [
     place && h("p", { class: "place" }, place),
-    latitude !== null && h("p", { class: place ? "where" : "place where" }, degrees(latitude, longitude), ring && h("span", { class: "radius" }, ` ± ${metres(estimate[ring])} (${100 * share} %)`)),
+    latitude !== null && h("p", { class: place ? "where" : "place where" }, degrees(latitude, longitude)),
     latitude !== null && coordinateTools(latitude, longitude),
   ];
 }
 
-/** How sure the answer is, or why there is none: one sentence. `bars` are those of the estimate. */
-function reason({ levels, answer_level: answer, certainty, not_in_map_probability: outside }, kind, bars) {
-  if (answer === null && outside > 0.5) return `${Math.round(100 * outside)} % sure that this map has no photo of the place.`;
-  if (kind === "unknown") return "The matches point to one place no more clearly than those of a photo from elsewhere do.";
-  const shown = answer ?? levels.length - 1;
-  const sure = bars.slice(0, shown + 1).reduce((sum, { share }) => sum + share, 0);
-  const { place, radius_m: radius } = levels[shown];
-  const words = `${sure > MOST_SURE ? `More than ${MOST_SURE}` : sure} % sure it is ${place ? `in “${place}”` : `within ${metres(radius)}`}`;
-  // An answer that is finer than the coarsest level also requires odds against “not in this map”.
-  const unclear = levels.slice(0, answer ?? levels.length).some(({ probability }) => probability >= certainty);
-  if (answer !== null) return `${words}.${unclear ? " A finer answer needs clearer signs that the place is in this map." : ""}`;
-  return `${words}${unclear ? ", but it is not clear whether the place is in this map" : `: an answer needs ${Number((100 * certainty).toFixed(1))} %`}.`;
-}
-
 /** What the place may be, with shares in whole percent that add up to 100: `{name, share, kind}`. */
 function shares({ levels, answer_level: answer }) {
-  const [finest, ...coarser] = levels;
-  const names = coarser.map(({ place, radius_m: radius }, index) => (place ? `Elsewhere in ${place}` : `${metres(levels[index].radius_m)} to ${metres(radius)} away`));
+  const [finest] = levels;
+  const names = levels.map(({ place, radius_m: radius, whole_map: whole }, index) => {
+    if (whole) return index ? "Elsewhere in this map" : "In this map";
+    if (place) return index ? `Elsewhere in ${place}` : place;
+    return index ? `${metres(levels[index - 1].radius_m)} to ${metres(radius)} away` : `Within ${metres(finest.radius_m)}`;
+  });
   const bounds = [...levels.map(({ probability }) => Math.round(100 * probability)), 100];
-  return [finest.place ?? `Within ${metres(finest.radius_m)}`, ...names, finest.place ? "Elsewhere, or not in this map" : "Farther away, or not in this map"].map((name, index) => ({
+  return [...names, "Not in this map"].map((name, index) => ({
     name,
     share: bounds[index] - (bounds[index - 1] ?? 0),
     kind: index === levels.length ? "outside" : index <= answer && answer !== null ? "chosen" : null,

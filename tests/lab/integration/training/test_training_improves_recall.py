@@ -14,7 +14,7 @@ from lab.evaluation.ranking import evaluate_recall
 from lab.evaluation.recall import compute_hits
 from lab.training.arguments import build_arguments
 from lab.training.checkpointing import seed_everything
-from lab.training.model_describer import ModelDescriber
+from lab.training.describing import ModelDescriber
 from lab.training.model_factory import make_model
 from lab.training.resolve import make_fabric
 from lab.training.run_control import NullDisplay

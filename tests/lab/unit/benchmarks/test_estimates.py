@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -95,9 +96,11 @@ def test_without_a_folder_the_tower_of_the_test_data_is_measured(
 ) -> None:
     described_folders = []
 
-    def describe(folder: Path, _: Progress) -> DescribedPhotos:
+    def describe(folder: Path, _: Progress, others: Sequence[Path]) -> DescribedPhotos:
+        assert others == []
         described_folders.append(folder)
-        return described()
+        rows = -described().rows[:20]
+        return replace(described(), foreign={"elsewhere": rows})
 
     monkeypatch.setattr(estimates, "describe_set", describe)
     monkeypatch.setenv("PLACEWISE_TEST_DATA", str(tmp_path))
@@ -107,6 +110,7 @@ def test_without_a_folder_the_tower_of_the_test_data_is_measured(
     assert described_folders == [tmp_path / "tower"]
     assert "house, half of its queries labelled" in output
     assert "95 % interval" in output
+    assert "house, photos of elsewhere" in output
     monkeypatch.delenv("PLACEWISE_TEST_DATA")
     with pytest.raises(Misconfigured, match="PLACEWISE_TEST_DATA"):
         estimates.bench()

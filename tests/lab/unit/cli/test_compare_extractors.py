@@ -24,13 +24,13 @@ def test_commas_separate_extractors_and_their_options() -> None:
 
 
 @pytest.mark.parametrize("text", ["a,,b", "+fit", "a+pca0", "a+pca512x", "a+other"])
-def test_what_means_no_extractor_is_refused(text: str) -> None:
+def test_invalid_lists_of_extractors_are_refused(text: str) -> None:
     with pytest.raises(InvalidRequest) as refused:
         parse_entries(text)
     assert refused.value.code == "bad_extractors"
 
 
-def test_front_holds_what_nothing_beats_in_price_and_worth() -> None:
+def test_the_pareto_front_holds_extractors_that_none_dominates() -> None:
     prices = [1.0, 2.0, 2.0, 3.0, 4.0, math.nan]
     worths = [0.5, 0.7, 0.6, 0.7, 0.9, 1.0]
     # dearer and worse than the second; as good and dearer; not measured

@@ -92,7 +92,7 @@ def test_check_names_a_ground_truth_that_differs_from_the_positions(tmp_path: Pa
     assert (problem["code"], problem["count"]) == ("ground_truth_differs", 1)
 
 
-def test_check_names_what_stands_twice(tmp_path: Path) -> None:
+def test_check_names_duplicates(tmp_path: Path) -> None:
     photos = street(tmp_path, "db", [0, 100])
     save_names(tmp_path / "my_dbImages.npy", [*photos, photos[0]])
     save_names(tmp_path / "my_qImages.npy", photos[:1])

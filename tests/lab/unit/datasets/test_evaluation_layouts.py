@@ -341,6 +341,27 @@ def test_numbered_frames_in_folders_need_no_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("summer", "winter", "positives", "paired_by"),
+    [
+        (["image-{:05d}.png"], ["image-{:05d}.png"], [[1], [2], [3], [4]], "number in their names"),
+        (["2013_{:03d}_640.png"], ["snow/{}.png"], [[1], [2], [3], [4]], "number in their names"),
+        (["{:02d}_summer.png"], ["winter-{}00.png"], [[0], [1], [2], [3]], "position"),
+        (["a/7.png", "b/7.png"], ["7.png"], [[0]], "position"),
+    ],
+)
+def test_seasons_are_paired_by_the_numbers_in_their_names_where_both_have_them(
+    summer: list[str], winter: list[str], positives: list[list[int]], paired_by: str, tmp_path: Path
+) -> None:
+    """Summer has the photos 0 to 5, winter 1 to 4."""
+    for season, names_, numbers in (("summer", summer, range(6)), ("winter", winter, range(1, 5))):
+        if len(summer) == 1:
+            names_ = [names_[0].format(number) for number in numbers]
+        write_photos(tmp_path / season, names_)
+    assert rows(open_evaluation_set(tmp_path, rule="frames 0")) == positives
+    assert paired_by in (open_evaluation_set(tmp_path).paired_by or "")
+
+
+@pytest.mark.parametrize(
     ("truth", "code"),
     [
         ([(3, [0])], "ground_truth_of_other_lists"),

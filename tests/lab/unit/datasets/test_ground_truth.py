@@ -87,7 +87,7 @@ def test_positive_is_within_25_metres_the_bound_included() -> None:
         ("place-label", PositiveRule("place-label")),
     ],
 )
-def test_rule_is_read_and_written_alike(text: str, rule: PositiveRule) -> None:
+def test_rules_round_trip_as_text(text: str, rule: PositiveRule) -> None:
     assert parse_rule(text) == rule
     assert parse_rule(str(rule)) == rule
 

@@ -46,7 +46,7 @@ def rows_of(path: Path) -> list[list[int]]:
 
 @given(st.lists(st.lists(st.integers(0, 2**40), unique=True)))
 @settings(deadline=None)
-def test_what_is_written_is_read_again_by_numpy_and_by_ourselves(
+def test_written_files_are_read_by_numpy_and_by_the_reader(
     tmp_path_factory: pytest.TempPathFactory, rows: list[list[int]]
 ) -> None:
     path = tmp_path_factory.mktemp("gt") / "gt.npy"
@@ -92,7 +92,7 @@ class Harm:
         return os.mkdir, (os.environ["PLACEWISE_TEST_HARM"],)
 
 
-def test_pickle_that_names_anything_else_is_refused_and_does_nothing(
+def test_pickles_of_other_classes_are_refused_and_not_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     harm = tmp_path / "harm"
@@ -125,7 +125,7 @@ def test_other_things_than_lists_of_indices_are_refused(tmp_path: Path, value: o
 
 @given(st.binary(max_size=80))
 @settings(deadline=None)
-def test_broken_bytes_are_an_error_that_is_explained(
+def test_corrupt_files_are_an_explained_error(
     tmp_path_factory: pytest.TempPathFactory, end: bytes
 ) -> None:
     path = tmp_path_factory.mktemp("gt") / "gt.npy"
@@ -173,7 +173,7 @@ def test_published_ground_truth_is_checked_by_its_rows_and_indices(tmp_path: Pat
 
 
 @pytest.mark.parametrize("message", ["", "[]", "{}", json.dumps({"database": 3, "rule": "x"})])
-def test_broken_word_of_what_it_belongs_to_is_no_permission(tmp_path: Path, message: str) -> None:
+def test_a_corrupt_fingerprint_of_the_lists_is_refused(tmp_path: Path, message: str) -> None:
     path = written(tmp_path)
     path.with_suffix(".json").write_text(message)
     with refused("bad_ground_truth"):

@@ -66,7 +66,7 @@ def building() -> tuple[EvaluationSet, Rows, Rows]:
     return made, rows[0], rows[1]
 
 
-@pytest.mark.parametrize(("scheme", "levels"), [(PATHS, 3), (CIRCLES, 3)])
+@pytest.mark.parametrize(("scheme", "levels"), [(PATHS, 3), (CIRCLES, 4)])
 def test_clear_queries_are_answered_and_those_outside_the_map_are_not(
     building: tuple[EvaluationSet, Rows, Rows], scheme: LevelScheme, levels: int
 ) -> None:

@@ -96,7 +96,7 @@ def test_every_argument_of_the_predecessor_is_there_with_its_default() -> None:
     assert {name: getattr(TrainingArguments(), name) for name in PREDECESSORS} == PREDECESSORS
 
 
-def test_the_published_command_means_what_its_authors_ran() -> None:
+def test_the_published_command_has_the_settings_of_its_authors() -> None:
     arguments = read(shlex.split(PUBLISHED_COMMAND))
     assert arguments.batch_size == 100
     assert arguments.image_size == (320, 320)
@@ -166,7 +166,7 @@ def test_validation_photos_have_the_size_of_training_unless_it_is_given() -> Non
         (["--no-pretrained", "--pretrained"], True),
     ],
 )
-def test_true_and_false_are_what_they_say(tokens: list[str], pretrained: bool) -> None:
+def test_boolean_words_are_parsed(tokens: list[str], pretrained: bool) -> None:
     assert read(tokens).pretrained is pretrained
 
 
@@ -201,7 +201,7 @@ def test_lists_sizes_and_words_are_read(tokens: list[str], name: str, value: obj
         ("agg_config", "{p: 3", "valid dictionary"),
     ],
 )
-def test_a_value_that_can_not_be_names_its_argument(name: str, text: str, message: str) -> None:
+def test_an_invalid_value_names_its_argument(name: str, text: str, message: str) -> None:
     with pytest.raises(InvalidRequest, match=message) as caught:
         build_arguments({name: text})
     assert f"--{name}" in caught.value.detail

@@ -72,7 +72,7 @@ def test_cities_keep_their_order_unless_all_places_are_shuffled() -> None:
     assert mixed != cities(PLAN)
 
 
-def test_places_are_shuffled_anew_every_so_many_epochs() -> None:
+def test_places_are_reshuffled_every_n_epochs() -> None:
     every_second = replace(PLAN, reshuffle_every_epochs=2)
     orders = [every_second.order(epoch).tolist() for epoch in range(4)]
     assert orders[0] == orders[1] != orders[2] == orders[3]
@@ -193,7 +193,7 @@ def test_a_large_jpeg_decoded_small_is_nearly_the_full_decoding(tmp_path: Path) 
     assert np.abs(small - expected).mean() < 2
 
 
-def test_a_photo_on_its_side_comes_out_upright(tmp_path: Path) -> None:
+def test_the_exif_orientation_is_applied(tmp_path: Path) -> None:
     image = Image.new("RGB", (640, 320))
     image.paste((255, 255, 255), (0, 0, 320, 320))  # the left half
     exif = Image.Exif()

@@ -77,7 +77,7 @@ def test_a_grid_is_every_combination_and_every_listed_run(tmp_path: Path) -> Non
         ("runs: [{name: a, batch_size: 0}]", "bad_argument", "--batch_size"),
     ],
 )
-def test_a_grid_that_can_not_be_is_refused_before_its_first_run(
+def test_an_invalid_grid_is_refused_before_its_first_run(
     text: str, code: str, message: str, tmp_path: Path
 ) -> None:
     with refused(code, re.escape(message)):
@@ -186,7 +186,7 @@ def test_failed_runs_are_named_with_each_reason_once_and_the_others_are_made(
     ]
 
 
-def test_a_grid_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_a_grid_resumes_with_the_missing_runs(tmp_path: Path) -> None:
     plan = plain_plan("done", "begun", "failed", "new")
     Runs(tmp_path, done=0.5, failed=RuntimeError("no")).go(plain_plan("done", "failed"))
     stopped = Runs(tmp_path, begun=RunStopped())

@@ -114,7 +114,7 @@ def test_own_losses_equal_those_of_the_library_in_value_and_gradient(
     np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-5)
 
 
-def test_an_anchor_without_negatives_costs_nothing_and_has_a_finite_gradient() -> None:
+def test_an_anchor_without_negatives_has_zero_loss_and_a_finite_gradient() -> None:
     rows = ROWS.clone().requires_grad_()
     pairs = tuple(torch.tensor(part) for part in ([0, 3], [1, 4], [0, 0], [5, 6]))
     loss = make_loss("NTXentLoss")(rows, LABELS, pairs)

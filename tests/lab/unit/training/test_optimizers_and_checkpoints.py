@@ -168,7 +168,7 @@ def test_random_numbers_continue_from_the_stored_state() -> None:
         ({"accelerator": "cuda"}, "no_gpu"),
     ],
 )
-def test_what_a_device_can_not_do_is_named(
+def test_unsupported_options_of_a_device_are_reported(
     values: dict[str, object], code: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)

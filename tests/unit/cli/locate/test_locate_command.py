@@ -23,14 +23,14 @@ from typer.testing import CliRunner, Result
 
 from services.cli.locate import command, preview, undo_journal, writers
 from services.cli.locate.folder import read_folder, read_gpx
-from services.cli.locate.sidecars import add_position, read_position
+from services.cli.locate.sidecars import add_position
 from services.cli.main import build_app
 from shared.errors import InvalidRequest
 from shared.imaging.photo_header import read_photo_header
 from shared.ingest.photo_metadata import read_csv_manifest
 from tests.support.api_responses import PHOTO, POSE, SIMILAR, STATS
 from tests.support.fake_server import FakeServer
-from tests.support.photos import encoded, exif_with_position, photo_image
+from tests.support.photos import encoded, exif_with_position, photo_image, sidecar_position
 
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
 LATITUDE, LONGITUDE = 45.0691, 7.6853
@@ -43,12 +43,15 @@ def photo(
     *,
     camera: str = "X100",
     offset: str | None = "+02:00",
+    serial: str = "1",
 ) -> bytes:
     """A JPEG that was taken so many seconds after noon UTC; the camera's clock is two ahead."""
     exif = Image.Exif()
     if north_m is not None:
         exif = exif_with_position(LATITUDE + north_m * DEGREES_PER_M, LONGITUDE)
     exif[Base.Make], exif[Base.Model] = "Maker", camera
+    if serial:
+        exif.get_ifd(IFD.Exif)[Base.BodySerialNumber] = serial
     if seconds is not None:
         clock = NOON + timedelta(hours=2, seconds=seconds)
         exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = f"{clock:%Y:%m:%d %H:%M:%S}"
@@ -110,7 +113,7 @@ def test_a_photo_is_placed_between_its_neighbours_of_the_same_camera(folder: Pat
 
 def test_cameras_that_travelled_together_are_neighbours_of_each_other(folder: Path) -> None:
     assert proposals(folder, "--together")["4.jpg"]["accepted"]
-    (folder / "5.jpg").write_bytes(photo(30, offset=None))
+    (folder / "5.jpg").write_bytes(photo(30, offset=None, camera="third"))
     refusal = run(folder, "--together")
     assert refusal.exit_code == 1
     assert "unknown_time_zone" in refusal.stderr
@@ -173,6 +176,38 @@ def test_a_sidecar_with_coordinates_counts_as_coordinates_of_the_photo(folder: P
     assert proposals(folder).keys() == {"day 1/2.jpg"}
 
 
+def test_a_photo_whose_gps_tag_is_not_understood_is_named_and_never_written(folder: Path) -> None:
+    unread = folder / "day 1" / "2.jpg"
+    with pyexiv2.Image(str(unread)) as image:
+        image.modify_exif({"Exif.GPSInfo.GPSLatitude": "45/1 4/1 12/1"})
+    (folder / "4.jpg.xmp").write_bytes(b"no XML")
+    before = contents(folder)
+    for target in ("exif", "sidecar"):
+        result = run(folder, "--together", "--write", target)
+        assert "day 1/2.jpg: its latitude has no letter N or S" in result.stderr
+        assert "4.jpg: its XMP is damaged" in result.stderr
+        assert before.items() <= contents(folder).items()
+    as_json = json.loads(run(folder, "--json").stdout)
+    assert (as_json["with_coordinates"], as_json["proposals"]) == (2, [])
+    assert [each["filename"] for each in as_json["not_understood"]] == ["4.jpg", "day 1/2.jpg"]
+
+
+def test_null_island_is_no_neighbour(folder: Path) -> None:
+    for name, seconds in (("1.jpg", 0), ("3.jpg", 40)):
+        zeroed = photo(seconds, -LATITUDE / DEGREES_PER_M)
+        (folder / name).write_bytes(zeroed)
+        with pyexiv2.Image(str(folder / name)) as image:
+            image.modify_exif({"Exif.GPSInfo.GPSLongitude": "0/1 0/1 0/1"})
+    found = proposals(folder)
+    assert found.keys() == {"1.jpg", "day 1/2.jpg", "3.jpg", "4.jpg"}
+    assert {each["position"] for each in found.values()} == {None}
+
+
+def test_a_clock_without_a_zone_is_named_with_the_way_to_give_it(folder: Path) -> None:
+    (folder / "5.jpg").write_bytes(photo(30, offset=None, camera="third"))
+    assert "Pass it: --time-zone +02:00" in run(folder).stderr
+
+
 def test_proposals_are_listed_and_nothing_is_written_unless_it_is_requested(folder: Path) -> None:
     before = contents(folder)
     result = run(folder)
@@ -192,7 +227,7 @@ def test_sidecars_are_written_for_accepted_proposals_and_undone(folder: Path) ->
     assert written.exit_code == 0, written.output
     assert "1 files written: day 1/2.jpg.xmp" in written.stderr
     assert written.stderr.rstrip().endswith(f" locate {folder} --undo")
-    position = read_position((folder / "day 1" / "2.jpg.xmp").read_bytes())
+    position = sidecar_position((folder / "day 1" / "2.jpg.xmp").read_bytes())
     assert position == pytest.approx((LATITUDE + 20 * DEGREES_PER_M, LONGITUDE), abs=1e-5)
     assert proposals(folder).keys() == {"4.jpg"}, "it has coordinates now"
     undone = run(folder, "--undo")
@@ -386,7 +421,7 @@ def answer(**changes: Any) -> dict[str, Any]:
         {"latitude": LATITUDE, "longitude": LONGITUDE, "radius_m": radius, "probability": 0.97}
         for radius in (25.0, 100.0)
     ]
-    estimate = {"reason": "", "levels": levels, "not_in_map_probability": 0.01}
+    estimate = {"headline": "", "reason": "", "levels": levels, "not_in_map_probability": 0.01}
     return {**SIMILAR, "similar_images": [similar], "estimate": estimate, **changes}
 
 
@@ -425,7 +460,7 @@ def test_what_a_preview_has_shown_is_written_although_the_map_answers_differentl
     shown = searched_proposals(server, folder)
     (folder / "new.jpg").write_bytes(photo(None))
     sure = [{"latitude": 44.0, "longitude": 7.0, "radius_m": 25.0, "probability": 1.0}]
-    will_find(server, answer(estimate={"reason": "", "levels": sure}))
+    will_find(server, answer(estimate={"headline": "", "reason": "", "levels": sure}))
     written = searched(server, folder, "--write", "csv")
     assert written.exit_code == 0, written.output
     assert "1 proposals are not as they were accepted then" in written.stderr
@@ -452,7 +487,7 @@ def test_no_photo_of_a_preview_is_searched_again_unless_it_has_changed_or_a_day_
     assert written.stdout == shown.stdout
     assert "All proposals are as they were then." in written.stderr
     (folder / "4.jpg").write_bytes(photo(26, camera="another"))
-    will_find(server, answer(estimate={"reason": "", "levels": []}))
+    will_find(server, answer(estimate={"headline": "", "reason": "", "levels": []}))
     written = searched(server, folder, "--write", "csv")
     assert written.stderr.rstrip().endswith(": 4.jpg")
     old = datetime.now(UTC) - preview.KEPT_FOR
@@ -466,7 +501,9 @@ def test_no_photo_of_a_preview_is_searched_again_unless_it_has_changed_or_a_day_
 def test_a_map_with_labels_only_gives_places(folder: Path, server: FakeServer) -> None:
     levels = [{"place": "tower/floor 7", "probability": 0.96}, {"place": "tower", "probability": 1}]
     unlocated = {**PHOTO, "latitude": None, "place": "tower/floor 7", "similarity_score": 0.9}
-    by_label = answer(similar_images=[unlocated], estimate={"reason": "", "levels": levels})
+    by_label = answer(
+        similar_images=[unlocated], estimate={"headline": "", "reason": "", "levels": levels}
+    )
     will_find(server, by_label, by_label)
     found = searched_proposals(server, folder)["4.jpg"]
     assert (found["place"], found["accepted"], found["position"]) == ("tower/floor 7", True, None)
@@ -515,7 +552,7 @@ def test_a_place_that_is_not_probable_enough_is_not_written_with_the_position(
     folder: Path, server: FakeServer
 ) -> None:
     levels = [{"place": "tower/floor 7", "probability": 0.3}]
-    unsure = answer(estimate={"reason": "", "levels": levels})
+    unsure = answer(estimate={"headline": "", "reason": "", "levels": levels})
     will_find(server, unsure, unsure)
     found = searched_proposals(server, folder)["day 1/2.jpg"]
     place = (found["accepted"], found["place"], found["place_probability"])

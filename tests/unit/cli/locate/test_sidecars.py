@@ -7,17 +7,12 @@ from pathlib import Path
 
 import pyexiv2
 import pytest
-from PIL import Image
 
-from services.cli.locate.sidecars import (
-    EXIF,
-    add_position,
-    embedded_xmp,
-    find_sidecar,
-    read_position,
-)
+from services.cli.ingest.local_headers import find_sidecars, read_local_header
+from services.cli.locate.sidecars import add_position
 from shared.errors import Unprocessable
-from tests.support.photos import photo_image
+from shared.imaging.xmp import EXIF
+from tests.support.photos import photo_bytes, sidecar_position
 
 DARKTABLE = b"""<?xml version="1.0" encoding="UTF-8"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/" x:xmptk="XMP Core 4.4.0-Exiv2">
@@ -32,14 +27,14 @@ DARKTABLE = b"""<?xml version="1.0" encoding="UTF-8"?>
  </rdf:RDF>
 </x:xmpmeta>
 """
-PLACES = [(48.8583736, 2.2944813), (-33.8567844, 151.2152967), (-0.0000001, -179.9999999), (0, 0)]
+PLACES = [(48.8583736, 2.2944813), (-33.8567844, 151.2152967), (-0.0000001, -179.9999999)]
 
 
 @pytest.mark.parametrize(("latitude", "longitude"), PLACES)
 def test_coordinates_are_read_back_within_a_decimetre(latitude: float, longitude: float) -> None:
     for existing in (None, DARKTABLE):
         sidecar = add_position(existing, latitude, longitude, 12.0)
-        assert read_position(sidecar) == pytest.approx((latitude, longitude), abs=1e-6)
+        assert sidecar_position(sidecar) == pytest.approx((latitude, longitude), abs=1e-6)
 
 
 def test_a_sidecar_is_edited_and_not_replaced() -> None:
@@ -72,7 +67,6 @@ def test_what_is_no_sidecar_is_refused(broken: bytes) -> None:
     with pytest.raises(Unprocessable) as refusal:
         add_position(broken or b" ", *PLACES[0], 12.0)
     assert refusal.value.code == "bad_sidecar"
-    assert read_position(broken) is None
 
 
 def test_a_property_that_is_there_is_not_written_twice() -> None:
@@ -84,23 +78,16 @@ def test_a_property_that_is_there_is_not_written_twice() -> None:
 
 def test_the_sidecar_with_the_whole_name_comes_first(tmp_path: Path) -> None:
     photo = tmp_path / "a.jpg"
-    assert find_sidecar(photo) is None
+    assert find_sidecars(photo) == []
     (tmp_path / "a.xmp").write_bytes(DARKTABLE)
-    assert find_sidecar(photo) == tmp_path / "a.xmp"
-    (tmp_path / "a.jpg.xmp").write_bytes(DARKTABLE)
-    assert find_sidecar(photo) == tmp_path / "a.jpg.xmp"
+    assert find_sidecars(photo) == [tmp_path / "a.xmp"]
+    (tmp_path / "a.jpg.XMP").write_bytes(DARKTABLE)
+    assert find_sidecars(photo) == [tmp_path / "a.jpg.XMP", tmp_path / "a.xmp"]
 
 
-def test_coordinates_in_the_xmp_of_a_photo_are_read() -> None:
-    photo = io.BytesIO()
-    photo_image(1).save(photo, "JPEG", xmp=add_position(None, *PLACES[0], 12.0))
-    xmp = embedded_xmp(photo)
-    assert xmp is not None
-    assert read_position(xmp) == pytest.approx(PLACES[0], abs=1e-6)
-    assert embedded_xmp(io.BytesIO(b"no photo")) is None
-    plain = io.BytesIO()
-    Image.new("RGB", (8, 8)).save(plain, "PNG")
-    assert embedded_xmp(plain) is None
+def test_a_sidecar_that_is_broken_is_not_taken_for_one_without_coordinates() -> None:
+    header = read_local_header(io.BytesIO(photo_bytes(1)), [DARKTABLE[:200]])
+    assert (header.latitude, header.gps_error) == (None, "its XMP is damaged")
 
 
 @pytest.mark.parametrize("existing", [None, DARKTABLE])

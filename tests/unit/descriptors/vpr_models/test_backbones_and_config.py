@@ -53,7 +53,9 @@ def noise(height: int = 64, width: int = 96, count: int = 2) -> torch.Tensor:
         ("resnet101", (2048, 32), 4, (1024, 16)),
         ("resnet152", (2048, 32), 4, (1024, 16)),
         ("resnext50_32x4d", (2048, 32), 3, (512, 8)),
+        ("vgg16", (512, 16), 4, (512, 8)),
         ("efficientnet_b0", (1280, 32), 6, (112, 16)),
+        ("efficientnet_b7", (2560, 32), 6, (224, 16)),
         ("efficientnet_lite0", (1280, 32), 8, (320, 32)),
         ("swin_t", (768, 32), 4, (384, 16)),
         ("dinov2_vits14", (384, 14), 4, (384, 14)),
@@ -134,7 +136,7 @@ def test_the_models_own_configuration_is_complete_and_the_given_one_stays() -> N
 @pytest.mark.parametrize(
     ("changes", "code", "message"),
     [
-        ({"backbone_arch": "vgg16"}, "unknown_backbone", "resnet18, resnet34"),
+        ({"backbone_arch": "alexnet"}, "unknown_backbone", "resnet18, resnet34"),
         ({"agg_arch": "fisher"}, "unknown_aggregator", "CosPlace, AVG, GeM"),
         ({"layers_to_freeze": 5}, "bad_model_config", "from -1"),
         ({"layers_to_crop": [1]}, "bad_model_config", "from 2 to 4"),

@@ -13,9 +13,10 @@ from shared.evaluation.places.evidence import PhotoLocation, RankedPhoto
 from shared.evaluation.places.figures import PlaceEvaluation, evaluate_places
 from shared.evaluation.places.fit import (
     MIN_LABELLED_QUERIES,
+    MapScores,
     PlaceSample,
     fit_place_model,
-    not_in_map_table,
+    missing_place_table,
 )
 from shared.evaluation.places.levels import (
     FEATURES,
@@ -25,14 +26,20 @@ from shared.evaluation.places.levels import (
     candidate_levels,
     shared_neighbours,
 )
-from shared.evaluation.places.probability import PlaceModel, error_radius_m, shipped_prior
+from shared.evaluation.places.probability import (
+    ELSEWHERE_SHARE,
+    Background,
+    Elsewhere,
+    MapExtent,
+    PlaceModel,
+    error_radius_m,
+    shipped_prior,
+)
 from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
 from shared.evaluation.places.thresholds import (
     CERTAINTIES,
     HeldOutEstimate,
-    Thresholds,
-    choose_in_map_limit,
-    choose_thresholds,
+    choose_threshold,
 )
 from shared.place_paths import is_within_level, label_levels, look_like_paths
 
@@ -41,6 +48,7 @@ pytestmark = pytest.mark.numerics
 PATHS = LevelScheme(labels_are_paths=True, radii_m=(25.0, 100.0))
 PLAIN = LevelScheme(labels_are_paths=False, radii_m=(25.0, 100.0))
 DEGREE_M = 111_195.0
+SCORES = MapScores(0.5, Background(mean=0.0, deviation=0.25))
 
 
 def label(place: str | None) -> PhotoLocation:
@@ -159,8 +167,8 @@ def test_the_prior_orders_a_clear_and_an_unclear_ranking_and_answers_neither() -
     sure, unsure = (PlaceModel().estimate(r, r[1:], PATHS, 0.95, 25.0) for r in (clear, unclear))
     assert sure is not None
     assert unsure is not None
-    assert sure.probabilities[0] > 0.8 > 0.6 > unsure.probabilities[0]
-    assert sure.not_in_map < unsure.not_in_map
+    assert sure.probabilities[0] > 0.6 > 0.45 > unsure.probabilities[0]
+    assert sure.not_in_map == unsure.not_in_map == ELSEWHERE_SHARE
     assert (sure.answer, unsure.answer) == (None, None)
     fitted = PlaceModel(source="own_photos").estimate(clear, clear[1:], PATHS, 0.5, 25.0)
     assert fitted is not None
@@ -216,91 +224,115 @@ def test_the_error_radius_lies_between_the_levels_that_enclose_its_share() -> No
     assert error_radius_m([CandidateLevel(place="a")], [0.99], 0.68) is None
 
 
-def test_an_answer_is_the_finest_level_over_the_threshold_with_enough_odds() -> None:
-    at_95 = Thresholds(probability=0.9, odds=(5.0,))
-    model = PlaceModel(source="own_photos", thresholds=(at_95,) * len(CERTAINTIES))
-    assert model.answer([0.91, 0.96], 0.1, 0.95) == 0
-    assert model.answer([0.91, 0.96], 0.3, 0.95) == 1  # probably not in the map
-    assert model.answer([0.5, 0.91], 0.1, 0.95) == 1
-    assert model.answer([0.5, 0.89], 0.1, 0.95) is None
-    assert model.answer([0.91, 0.96], 0.1, 1.0) is None  # beyond the stored certainties
+def test_an_answer_is_the_finest_level_over_the_threshold_if_the_query_is_in_the_map() -> None:
+    model = PlaceModel(source="own_photos", thresholds=(0.9,) * len(CERTAINTIES))
+    assert model.answer([0.91, 0.96], 0.04, 0.95) == 0
+    assert model.answer([0.91, 0.92], 0.08, 0.95) is None
+    assert model.answer([0.5, 0.91], 0.04, 0.95) == 1
+    assert model.answer([0.5, 0.89], 0.04, 0.95) is None
     without_thresholds = PlaceModel(source="own_photos")
-    assert without_thresholds.answer([0.94, 0.96], 0.1, 0.95) == 1  # the certainty is one
+    assert without_thresholds.answer([0.94, 0.96], 0.04, 0.95) == 1  # the certainty is one
+    assert [model.is_in_map(missing) for missing in (0.05, 0.06, 0.5, 0.51)] == [
+        True, None, None, False,
+    ]  # fmt: skip
 
 
 def test_the_threshold_is_the_lowest_with_the_certainty_as_share_of_right_answers() -> None:
     """Answers of both levels count together: the sure ones make up for those near the threshold."""
     sure = [held_out([0.99, 0.99], [True, True]) for _ in range(90)]
     unsure = [held_out([0.1, 0.86 + n / 1000], [False, n % 2 == 0]) for n in range(20)]
-    found = choose_thresholds([*sure, *unsure], [], 0.95).probability
-    assert found is not None
+    found = choose_threshold([*sure, *unsure], 0.95)
     assert 0.86 < found < 0.95
     answered = [s for s in unsure if s.probabilities[1] >= found]
     wrong = sum(not s.is_right[1] for s in answered)
     assert (wrong + 1) / (len(sure) + len(answered) + 1) <= 0.05
-    assert choose_thresholds(unsure, [], 0.95).probability is None
-    assert choose_thresholds([], [], 0.95) == Thresholds()
+    assert choose_threshold(unsure, 0.95) == 0.95
+    assert choose_threshold([], 0.95) == 0.95
 
 
-def test_at_most_one_impostor_in_twenty_gets_an_answer_at_the_finest_level() -> None:
-    """For 19 of 20 draws of the impostors, not only on average."""
-    rng = np.random.default_rng(0)
-    right = [held_out([0.97], [True]) for _ in range(200)]
-    shares = []
-    for _ in range(100):
-        draw = rng.uniform(0.001, 0.02, 200).tolist()
-        impostors = [held_out([0.97], [False], value, "level 0") for value in draw]
-        thresholds = choose_thresholds(right, impostors, 0.95)
-        new = rng.uniform(0.001, 0.02, 2000).tolist()
-        shares.append(np.mean([thresholds.answer([0.97], value, 0.95) == 0 for value in new]))
-    assert np.mean(np.array(shares) > 0.05) <= 0.08
-    assert np.mean(shares) > 0.01
-    few = choose_thresholds(right, impostors[:20], 0.95)
-    assert [few.answer([0.97], s.not_in_map, 0.95) for s in impostors[:20]] == [None] * 20
+# --- elsewhere -------------------------------------------------------------------------------
 
 
-def test_a_level_with_too_few_impostors_is_no_answer() -> None:
-    """In a map of one room, nothing tells a query of another room."""
-    right = [held_out([0.97, 0.98], [True, True]) for _ in range(200)]
-    wrong = [held_out([0.1, 0.98], [False, True], 0.5, "level 0") for _ in range(59)]
-    assert choose_thresholds(right, wrong, 0.95).answer([0.97, 0.98], 0.0, 0.95) == 0
-    assert choose_thresholds(right, wrong[:58], 0.95).answer([0.97, 0.98], 0.0, 0.95) == 1
-    one_room = [held_out([0.97], [True]) for _ in range(200)]
-    thresholds = choose_thresholds(one_room, [], 0.95)
-    assert thresholds.answer([1.0], 0.0, 0.95) is None
-    assert Thresholds.model_validate_json(thresholds.model_dump_json()) == thresholds
+def of_score(best_score: float, votes: float = 0.0) -> list[CandidateLevel]:
+    features = np.zeros(len(FEATURES))
+    features[0] = votes
+    return [CandidateLevel(place="a", features=features, best_score=best_score)]
 
 
-def test_the_odds_exclude_impostors_of_each_kind_at_every_level_but_the_coarsest() -> None:
-    right = [held_out([0.97, 0.98, 0.99], [True] * 3) for _ in range(200)]
-    easy = [held_out([0.1, 0.2, 0.99], [False, False, True], 0.8, "level 1") for _ in range(2000)]
-    hard = [held_out([0.97, 0.98, 0.99], [False, True, True], 0.02, "level 0") for _ in range(60)]
-    areas = choose_thresholds(right, [*easy, *hard], 0.95)
-    assert areas.answer([0.97, 0.98, 0.99], 0.02, 0.95) == 1  # 3 % of all, but all of their kind
-    floors = [held_out([0.97, 0.98, 0.99], [False] * 3, 0.02, "level 1") for _ in range(60)]
-    assert choose_thresholds(right, floors, 0.95).answer([0.97, 0.98, 0.99], 0.02, 0.95) == 2
+def test_the_last_level_is_the_whole_map_and_adds_up_to_one_with_not_in_this_map() -> None:
+    far = [north(0), north(400)]
+    extent = MapExtent.of(far, PLAIN)
+    assert extent.diameter_m == pytest.approx(400, abs=1)
+    circles = [
+        CandidateLevel(
+            latitude=45.0, longitude=7.0, radius_m=r, features=np.zeros(len(FEATURES)), best_score=1
+        )
+        for r in (25.0, 100.0, 500.0, 2000.0)
+    ]
+    levels = extent.end_levels(circles)
+    assert [level.radius_m for level in levels] == [25.0, 100.0, extent.diameter_m]
+    assert [level.is_whole_map for level in levels] == [False, False, True]
+    model = PlaceModel(
+        source="own_photos",
+        extent=extent,
+        elsewhere=Elsewhere(
+            coefficients=(1.0, -2.0, 0.0),
+            matched=(0.0,) * 4,
+            background=Background(mean=0.0, deviation=1.0),
+        ),
+    )
+    probabilities, missing = model.probabilities(levels)
+    assert probabilities == sorted(probabilities)
+    assert probabilities[-1] + missing == pytest.approx(1)
+    for share in (0.01, 0.33, 0.9):
+        odds = share / (1 - share) * np.exp(1 - 2)
+        assert model.probabilities(levels, share)[1] == pytest.approx(odds / (1 + odds))
 
 
-@pytest.mark.parametrize("count", [19, 39, 60, 300])
-def test_one_new_impostor_in_twenty_is_below_the_limit_on_average(count: int) -> None:
-    """Of a uniform probability, the share t is below the limit t."""
-    rng = np.random.default_rng(count)
-    limits = []
-    for _ in range(400):
-        impostors = [held_out([0.5], [False], x, "level 0") for x in rng.uniform(0, 1, count)]
-        limit = choose_in_map_limit(impostors)
-        assert limit is not None
-        limits.append(limit)
-    assert 0.03 < np.mean(limits) < 0.055
+def test_the_whole_map_is_named_by_the_label_that_all_photos_share() -> None:
+    floors = [label("tower/1/hall"), label("tower/2/hall")]
+    levels = [CandidateLevel(place=p, is_path=True) for p in ("tower/1/hall", "tower/1", "tower")]
+    one_tower = MapExtent.of(floors, PATHS).end_levels(levels)
+    assert [(level.place, level.is_whole_map) for level in one_tower] == [
+        ("tower/1/hall", False), ("tower/1", False), ("tower", True),
+    ]  # fmt: skip
+    two = MapExtent.of([*floors, label("mall/1/hall")], PATHS).end_levels(levels)
+    assert [(level.place, level.is_whole_map) for level in two][2:] == [
+        ("tower", False), (None, True),
+    ]  # fmt: skip
 
 
-def test_the_limit_is_that_of_the_kind_of_impostors_that_looks_most_like_the_map() -> None:
-    easy = [held_out([0.5], [False], 0.5 + n / 1000, "everything near") for n in range(200)]
-    hard = [held_out([0.5], [False], 0.1 + n / 1000, "level 0") for n in range(19)]
-    assert choose_in_map_limit([*easy, *hard]) == 0.1
-    assert choose_in_map_limit([*easy, *hard[1:]]) == easy[9].not_in_map, "18 give no limit"
-    assert choose_in_map_limit(hard[1:]) is None
-    assert choose_in_map_limit([]) is None
+def test_the_more_similar_the_best_photo_and_the_clearer_its_place_the_less_is_it_elsewhere() -> (
+    None
+):
+    known = shipped_prior().elsewhere["efficientnet-lite0-vlad128"]
+    by_score = [known.probability(of_score(score), 0.33) for score in (0.05, 0.1, 0.15, 0.3)]
+    assert by_score == sorted(by_score, reverse=True)
+    assert by_score[0] > 0.8
+    assert by_score[-1] < 0.01
+    by_votes = [known.probability(of_score(0.12, votes), 0.33) for votes in (-2.0, 2.0, 6.0)]
+    assert by_votes == sorted(by_votes, reverse=True)
+    matched = [
+        replace(
+            of_score(0.12)[0],
+            features=np.append(np.zeros(len(FEATURES)), [support / 100, 0, 0, 0, 0]),
+        )
+        for support in (5.0, 10.0, 60.0)
+    ]
+    by_matches = [known.probability([level], 0.33) for level in matched]
+    assert by_matches == sorted(by_matches, reverse=True)
+    assert by_matches[-1] < 0.01
+
+
+def test_an_extractor_of_unknown_scores_learns_from_photos_without_their_surroundings() -> None:
+    """Foreign photos score less than these, so that at most one in twenty is said to be in it."""
+    samples = own_samples(noise=0.3)
+    model = fit_place_model(samples, [], PATHS, SCORES).model
+    assert model.elsewhere is not None
+    away = [s for s in samples if s.left_out == "level 1"]
+    own = [s for s in samples if s.left_out is None]
+    assert np.mean([bool(model.accepts(s.levels)) for s in away]) <= 0.05
+    assert np.mean([bool(model.accepts(s.levels)) for s in own]) > 0.7
 
 
 def test_an_own_photo_that_is_alone_at_its_place_is_no_example_of_a_query_in_the_map() -> None:
@@ -308,8 +340,8 @@ def test_an_own_photo_that_is_alone_at_its_place_is_no_example_of_a_query_in_the
     together = list(sampler(8, 2, 0.1).samples(range(16), 0.5))
     assert {s.is_alone for s in alone if s.left_out is None} == {True}
     assert {s.is_alone for s in together if s.left_out is None} == {False}
-    assert not_in_map_table(alone).weights.sum() == 0, "the prior is left as it is"
-    table = not_in_map_table([*alone, *together])
+    assert missing_place_table(alone).weights.sum() == 0, "the prior is left as it is"
+    table = missing_place_table([*alone, *together])
     assert (table.target == 0).sum() == 16
 
 
@@ -319,7 +351,8 @@ def held_out(
     not_in_map: float = 0.0,
     left_out: str | None = None,
 ) -> HeldOutEstimate:
-    return HeldOutEstimate(probabilities, not_in_map, right, left_out, 1.0)
+    """The last level, that of the whole map, is added."""
+    return HeldOutEstimate([*probabilities, 1.0], not_in_map, [*right, True], left_out, 1.0)
 
 
 def test_shared_neighbours_are_those_that_the_query_and_its_best_photo_find_first() -> None:
@@ -378,11 +411,13 @@ def own_samples(places: int = 40, per_place: int = 5, noise: float = 1.0) -> lis
 
 
 def test_held_out_photos_have_the_observed_probabilities_and_few_impostors_get_an_answer() -> None:
-    evaluation = evaluate_places(own_samples(), [], PATHS, 0.5)
+    evaluation = evaluate_places(own_samples(), [], PATHS, SCORES)
     assert evaluation.figures is not None
     assert evaluation.model.source == "own_photos"
     for level in evaluation.figures["levels"]:
-        assert level["calibration_error"] < 0.1
+        stated = np.mean([each["stated"] for each in level["reliability"]])
+        assert stated < level["accuracy"] + 0.05, "never surer than it is"
+        assert level["calibration_error"] < 0.35
         assert level["samples"] == 200
     shares = []
     for answers in evaluation.figures["answers"]:
@@ -396,9 +431,9 @@ def test_held_out_photos_have_the_observed_probabilities_and_few_impostors_get_a
 
 def test_a_map_of_few_photos_keeps_the_prior_and_a_small_one_stays_near_it() -> None:
     few = [s for s in own_samples() if s.photo < 19]
-    assert fit_place_model(few, [], PATHS, 0.5).model == PlaceModel()
-    small = fit_place_model([s for s in own_samples() if s.photo < 30], [], PATHS, 0.5).model
-    large = fit_place_model(own_samples(), [], PATHS, 0.5).model
+    assert fit_place_model(few, [], PATHS, SCORES).model == PlaceModel()
+    small = fit_place_model([s for s in own_samples() if s.photo < 30], [], PATHS, SCORES).model
+    large = fit_place_model(own_samples(), [], PATHS, SCORES).model
     assert (small.own_photos, large.own_photos) == (30, 200)
 
     def change(model: PlaceModel) -> float:
@@ -424,14 +459,14 @@ def test_labelled_queries_refine_the_model() -> None:
     samples = own_samples(noise=0.3)
     own = [s for s in samples if s.left_out is None][: MIN_LABELLED_QUERIES + 20]
     wrong = [PlaceSample(n, s.levels, [bool(n % 2)] * len(s.levels)) for n, s in enumerate(own)]
-    fitted = fit_place_model(samples, wrong, PATHS, 0.5)
+    fitted = fit_place_model(samples, wrong, PATHS, SCORES)
     assert fitted.model.source == "labelled_queries"
-    before = fit_place_model(samples, [], PATHS, 0.5).model
+    before = fit_place_model(samples, [], PATHS, SCORES).model
     sure = [before.probabilities(s.levels)[0][0] for s in own]
     refined = [fitted.model.probabilities(s.levels)[0][0] for s in own]
     assert np.mean(sure) > 0.9
     assert abs(np.mean(refined) - 0.5) < abs(np.mean(sure) - 0.5)
-    too_few = fit_place_model(samples, wrong[: MIN_LABELLED_QUERIES - 1], PATHS, 0.5)
+    too_few = fit_place_model(samples, wrong[: MIN_LABELLED_QUERIES - 1], PATHS, SCORES)
     assert too_few.model == before
 
 
@@ -454,10 +489,10 @@ def test_matches_answer_what_similar_descriptors_leave_open() -> None:
     own = sampler(places=40, per_place=5, noise=1.2)
     photos = range(200)
     spread = own.spread(photos)
-    plain = evaluate_places(list(own.samples(photos, spread)), [], PATHS, spread)
+    plain = evaluate_places(list(own.samples(photos, spread)), [], PATHS, SCORES)
     samples = list(own.samples(photos, spread, true_support))
     assert len(samples[0].levels[0].features) == len(FEATURES) + len(MATCH_FEATURES)
-    matched = evaluate_places(samples, [], PATHS, spread)
+    matched = evaluate_places(samples, [], PATHS, SCORES)
     assert answered(matched) > answered(plain) + 0.3
     assert matched.figures is not None
     assert matched.figures["answers"][2]["precision"]["mean"] >= 0.95

@@ -14,10 +14,12 @@ from services.extractor.geometry.mapping import (
     PhotoToMap,
     import_model,
     map_photos,
+    turned_camera,
 )
 from services.extractor.geometry.matching import VerifiedMatches, match_pairs
 from shared.errors import Unprocessable
-from shared.geometry.cameras import Camera, CameraSource
+from shared.geometry.cameras import Camera, CameraSource, Rays
+from shared.geometry.colmap_model import CAMERA_MODELS
 from shared.geometry.component import NO_POINT, Component
 from shared.geometry.frames import umeyama
 from shared.geometry.localise import LocalPose, localise
@@ -205,6 +207,70 @@ def test_model_has_the_positions_of_its_photos_as_its_frame(
     found = only(map_photos(placed, matches, tmp_path, lambda _: None, lambda: None)).component
     expected = np.array([10 * truth[id_] + (300, -200, 5) for id_ in found.photo_ids])
     assert np.abs(found.centres() - expected).max() < 0.3
+
+
+@pytest.mark.parametrize("is_read_upright", [False, True])
+def test_imported_poses_are_turned_as_exif_turns_the_photos(
+    scene: ReconstructedScene, mapped: MappedComponent, tmp_path: Path, is_read_upright: bool
+) -> None:
+    """COLMAP reads photos as they lie; a model of other software may be of upright ones."""
+    turns = [0, 1, 2, 3]
+    model = pycolmap.Reconstruction(str(mapped.folder))
+    model.delete_all_points2D_and_points3D()
+    source = pycolmap.Reconstruction()
+    photos, matches = everything(scene)
+    by_name = {str(photo.id): photo for photo in photos}
+    for number, image in sorted(model.images.items()):
+        turn = turns[number % 4]
+        by_name[image.name] = replace(
+            by_name[image.name], quarter_turns=turn, camera=bytes([7] * 32)
+        )
+        back = 0 if is_read_upright else -turn % 4
+        camera = turned_camera(pycolmap, image.camera, back)
+        camera.camera_id = number
+        source.add_camera_with_trivial_rig(camera)
+        angle = np.radians(90 * back)
+        roll = pycolmap.Rigid3d(pycolmap.Rotation3d([0, 0, angle]), np.zeros(3))
+        lying = pycolmap.Image(name=image.name, camera_id=number, image_id=number)
+        source.add_image_with_trivial_frame(lying, roll * image.cam_from_world())
+    (tmp_path / "source").mkdir()
+    source.write_text(str(tmp_path / "source"))
+    names = {str(photo): photo for photo in scene.features}
+    (tmp_path / "out").mkdir()
+    turned = list(by_name.values())
+    found = only(
+        import_model(turned, names, matches, tmp_path / "out", tmp_path / "source", lambda: None)
+    ).component
+    assert set(found.photo_ids) == set(scene.features)
+    rows = [mapped.component.photo_ids.index(photo) for photo in found.photo_ids]
+    for photo, row in enumerate(rows):
+        np.testing.assert_allclose(found.rotation(photo), mapped.component.rotation(row), atol=1e-6)
+    assert len(found.points) > 200
+    known = found.find_camera(bytes([7] * 32))
+    assert known is not None
+    assert known.focal_length == pytest.approx(mapped.component.cameras[0].focal_length)
+
+
+@pytest.mark.parametrize("name", [name for name, _ in CAMERA_MODELS.values()])
+def test_rays_of_a_camera_of_any_model_are_those_of_its_turned_photos(name: str) -> None:
+    camera = pycolmap.Camera.create_from_model_name(1, name, 400.0, 640, 480)
+    params = np.array(camera.params)
+    params[camera.principal_point_idxs()] += (60, -30)
+    params[camera.extra_params_idxs()] = np.linspace(0.004, 0.01, len(camera.extra_params_idxs()))
+    if name in ("EUCM", "FOV"):
+        params[camera.extra_params_idxs()] = (0.6, 1.1) if name == "EUCM" else 0.8
+    camera.params = params.tolist()
+    rays = Rays.fit(camera.cam_ray_from_img, (640, 480), 400 / 640, bytes(32), 0)
+    pixels = np.random.default_rng(0).uniform((60, 60), (580, 420), (50, 2))
+    seen = np.array(camera.cam_from_img(pixels))
+    np.testing.assert_allclose(rays.undistort(pixels, 640, 480), 400 * seen + (320, 240), atol=0.1)
+    turned = turned_camera(pycolmap, camera, 1)  # what was at (x, y) is at (480 - y, x)
+    moved = np.column_stack([480 - pixels[:, 1], pixels[:, 0]])
+    quarter = np.column_stack([-seen[:, 1], seen[:, 0]])
+    np.testing.assert_allclose(np.array(turned.cam_from_img(moved)), quarter, atol=1e-6)
+    np.testing.assert_allclose(
+        rays.turned(1).undistort(moved, 480, 640), 400 * quarter + (240, 320), atol=0.1
+    )
 
 
 def test_photos_of_different_scenes_are_components_of_their_own(

@@ -1,0 +1,188 @@
+"""`placewise describe PHOTOS --out FILE`: compute descriptors of photos without a server."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from services.cli.environment import read_settings, require_packages
+from services.cli.output import JsonOption, print_result, progress_bar
+from shared.errors import InvalidRequest
+from shared.extractor_config.configs import (
+    EXTRACTOR_AGGREGATORS,
+    EXTRACTOR_CONFIGS,
+    FACETS,
+    PREPROCESSING_NAMES,
+    add_extractor_options,
+    get_extractor_config,
+)
+
+# Keyed by the publisher's names, such as `dinov2_vits14`.
+BACKBONES = {
+    config.backbone.replace("dinov2-", "dinov2_"): name
+    for name, config in EXTRACTOR_CONFIGS.items()
+    if not config.for_tests
+}
+
+
+def describe(
+    photos: Annotated[
+        list[Path], typer.Argument(metavar="PHOTOS...", help="Photo files, in row order.")
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out",
+            metavar="FILE.npy|FILE.h5",
+            help="Output file: one row per photo (.npy), or hloc global features (.h5).",
+        ),
+    ],
+    extractor: Annotated[
+        str | None,
+        typer.Option(
+            help="Extractor name, with options as in EXTRACTOR. Default: the setting EXTRACTOR.",
+        ),
+    ] = None,
+    backbone: Annotated[
+        str | None, typer.Option(help=f"Backbone, instead of --extractor: {', '.join(BACKBONES)}.")
+    ] = None,
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True,
+            dir_okay=False,
+            help="Checkpoint of `placewise train`, instead of --extractor.",
+        ),
+    ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option(help="DINOv2 weights: .pth, .pt or .safetensors."),
+    ] = None,
+    layer: Annotated[int | None, typer.Option(help="Transformer block, counted from 0.")] = None,
+    facet: Annotated[
+        str | None, typer.Option(help=f"Facet of the transformer layer: {', '.join(FACETS)}.")
+    ] = None,
+    preprocessing: Annotated[
+        str | None,
+        typer.Option(
+            help=f"Resizing and cropping: {', '.join(PREPROCESSING_NAMES)}. "
+            "Default: the extractor's own."
+        ),
+    ] = None,
+    aggregator: Annotated[
+        str | None,
+        typer.Option(help=f"Aggregation of patch features: {', '.join(EXTRACTOR_AGGREGATORS)}."),
+    ] = None,
+    temperature: Annotated[
+        float | None, typer.Option(help="Softmax temperature of soft-vlad. Default: 1.")
+    ] = None,
+    vocabulary: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True,
+            dir_okay=False,
+            help="VLAD vocabulary: .npz of `vocabulary fit`, .npy, or AnyLoc's c_centers.pt.",
+        ),
+    ] = None,
+    pca: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True,
+            dir_okay=False,
+            help="PCA whitening to apply: .safetensors of `models fit-pca`.",
+        ),
+    ] = None,
+    root: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True,
+            file_okay=False,
+            help="With FILE.h5: name photos by paths relative to this folder. Default: as given.",
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compute descriptors of photos and write them to a file.
+
+    A .npy file contains one float32 row per photo, in the given order. An .h5 file contains a group
+    per photo with the dataset `global_descriptor`. If a photo can't be described, it is reported
+    and no file is written.
+    """
+    # Must be set before torch is loaded below; see services/cli/__init__.py.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    names = _hdf5_names(photos, out, root)
+    settings = read_settings()
+    chosen = {"--checkpoint": checkpoint, "--extractor": extractor, "--backbone": backbone}
+    if len(given := [option for option, value in chosen.items() if value is not None]) > 1:
+        raise InvalidRequest("options_contradict", f"{' and '.join(given)} exclude each other.")
+    if checkpoint is not None:
+        extractor = f"gsv:{checkpoint.absolute()}"
+    elif backbone is not None:
+        if backbone not in BACKBONES:
+            raise InvalidRequest(
+                "unknown_backbone",
+                f"Unknown backbone {backbone!r}. Available: {', '.join(BACKBONES)}.",
+            )
+        extractor = BACKBONES[backbone]
+    options = {
+        "layer": layer,
+        "facet": facet,
+        "preprocessing": preprocessing,
+        "aggregator": aggregator,
+        "temperature": temperature,
+    }
+    name = add_extractor_options(extractor or settings.new_map_extractor, options)
+    config = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
+    if weights is not None:
+        if config.depth is None:
+            raise InvalidRequest(
+                "weights_unused",
+                f"--weights applies only to extractors based on DINOv2, not to {config.name}.",
+            )
+        settings = settings.model_copy(update={"dino_weights": weights.absolute()})
+
+    from lab.cli.descriptors.describe_files import describe_files
+
+    with progress_bar() as progress:
+        bar = progress.add_task("describing", total=len(photos))
+        result = describe_files(
+            photos,
+            out,
+            config,
+            vocabulary,
+            pca,
+            settings,
+            lambda n: progress.advance(bar, n),
+            names=names,
+        )
+    print_result(
+        result,
+        as_json,
+        f"Wrote {result['rows']} rows of {result['dimension']} dimensions to {result['file']} "
+        f"({config.name}, {result['seconds']['total']:.1f} s).",
+    )
+
+
+def _hdf5_names(photos: Sequence[Path], out: Path, root: Path | None) -> list[str] | None:
+    """The names of the photos in an .h5 file; None for an .npy file."""
+    if out.suffix not in (".h5", ".hdf5"):
+        if root is not None:
+            raise InvalidRequest("options_contradict", "--root requires --out FILE.h5.")
+        return None
+    require_packages("h5py")
+    try:
+        paths = [(p.absolute().relative_to(root.absolute()) if root else p) for p in photos]
+    except ValueError as error:
+        raise InvalidRequest("bad_names", f"All photos must be below --root: {error}.") from error
+    names = [path.as_posix().lstrip("/") for path in paths]
+    duplicates = [name for name, count in Counter(names).items() if count > 1]
+    if duplicates:
+        raise InvalidRequest(
+            "bad_names", f"{duplicates[0]} is given more than once. Names must be unique."
+        )
+    return names
