@@ -15,10 +15,6 @@ database photos only, as that of a live map is, and judged
   four times: how many of the photos of these labels get an answer;
 - on photos of elsewhere, those of each of the other folders: how many get an answer.
 
-If the labels are paths, the photos of each second coarsest label are then followed as a walk, in
-the order of their names, which end with a number of seconds: its queries through the whole map, and
-all its photos through the map without this label.
-
 Intervals are those of the cluster bootstrap (`shared/evaluation/bootstrap.py`).
 """
 
@@ -26,10 +22,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -39,18 +34,10 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from lab.benchmarks.report import Report, printed_report
-from lab.datasets.dataset import DatasetPhoto, EvaluationSet
-from lab.datasets.ground_truth import find_positives, parse_rule
+from lab.datasets.dataset import EvaluationSet
 from lab.datasets.open_dataset import open_evaluation_set
 from lab.evaluation.places import measure_background
 from lab.evaluation.query_clusters import cluster_queries
-from lab.evaluation.sequences import (
-    FrameResult,
-    SequenceMap,
-    evaluate_sequence,
-    prepare_map,
-    sequence_figures,
-)
 from services.cli.environment import read_settings
 from services.cli.output import JsonOption, Table
 from shared.errors import Misconfigured
@@ -64,11 +51,7 @@ from shared.evaluation.places.evidence import (
 )
 from shared.evaluation.places.fit import MapScores, PlaceSample, fit_place_model
 from shared.evaluation.places.levels import LevelScheme, candidate_levels
-from shared.evaluation.places.probability import (
-    MapExtent,
-    PlaceEstimate,
-    PlaceModel,
-)
+from shared.evaluation.places.probability import MapExtent, PlaceEstimate, PlaceModel
 from shared.evaluation.places.samples import (
     IndexRanking,
     MatchOwnPhoto,
@@ -76,12 +59,10 @@ from shared.evaluation.places.samples import (
     attach_matches,
 )
 from shared.place_paths import label_levels
-from shared.tracks.motion import MOTION_MODELS
 
 CERTAINTY = 0.95
 LEFT_OUT_GROUPS = 4
 FOREIGN_PHOTOS = 150  # of each other folder
-WALK = MOTION_MODELS["walk"]
 Mask = NDArray[np.bool_]
 
 
@@ -198,8 +179,6 @@ def measure_set(report: Report, photos: DescribedPhotos, splits: int, progress: 
         add_left_out(report, f"{photos.name}, labels left out", left_out)
     for name, rows in photos.foreign.items():
         add_foreign(report, f"{photos.name}, photos of {name}", photos, rows)
-    if photos.dataset is not None and photos.scheme.labels_are_paths:
-        add_walks(report, photos.dataset, photos)
 
 
 def describe_set(folder: Path, progress: Progress, others: Sequence[Path] = ()) -> DescribedPhotos:
@@ -366,49 +345,6 @@ def left_out_labels(photos: DescribedPhotos) -> Iterable[Mask]:
     names = sorted({*labels.tolist()} - {""})
     for group in range(LEFT_OUT_GROUPS if len(names) > LEFT_OUT_GROUPS else 0):
         yield np.isin(labels, names[group::LEFT_OUT_GROUPS])
-
-
-def add_walks(report: Report, dataset: EvaluationSet, photos: DescribedPhotos) -> None:
-    """Report what tracks claim on floors that the map has, and on floors that it lacks."""
-    every = [*dataset.database, *dataset.queries]
-    floors = np.array([label_levels(photo.place, True)[-2:][0] for photo in every])
-
-    def open_map(in_map: Mask) -> tuple[EvaluationSet, SequenceMap]:
-        found = replace(dataset, database=tuple(every[n] for n in np.flatnonzero(in_map)))
-        return found, prepare_map(found, photos.rows[in_map], WALK)
-
-    whole, queries, missing = open_map(~photos.is_query), [], []
-    for floor in sorted({*floors.tolist()}):
-        there = floors == floor
-        queries.append(_follow(*whole, every, photos.rows, photos.is_query & there))
-        without = open_map(~photos.is_query & ~there)
-        missing += _follow(*without, every, photos.rows, there)
-    figures, what = sequence_figures(queries), f"{dataset.name}, walks of its queries"
-    report.add(f"{what}: tracking", 100 * figures["tracking"], "%")
-    right = figures["tracking_precision"]
-    report.add(f"{what}: right among them", 100 * (right or 0.0), "%", at_least=100 * CERTAINTY)
-    tracked = 100 * float(np.mean([frame.status == "tracking" for frame in missing]))
-    what = f"{dataset.name}, walks on floors left out"
-    report.add(f"{what}: tracking", tracked, "%", at_most=100 * (1 - CERTAINTY))
-
-
-def _follow(
-    dataset: EvaluationSet,
-    map_: SequenceMap,
-    every: Sequence[DatasetPhoto],
-    rows: NDArray[np.float32],
-    walked: Mask,
-) -> list[FrameResult]:
-    """Follow the photos of a walk in the order of their names."""
-    walk = sorted(np.flatnonzero(walked).tolist(), key=lambda n: every[n].path.name)
-    stems = [every[n].path.stem for n in walk]
-    numbers = [int("0" + stem[len(stem.rstrip("0123456789")) :]) for stem in stems]
-    steps = [max(1, after - before) for before, after in pairwise(numbers)]
-    seconds = np.cumsum([0, *steps]).tolist()
-    frames = [replace(every[n], frame=second) for n, second in zip(walk, seconds, strict=True)]
-    positives = tuple(find_positives(parse_rule(dataset.rule), frames, dataset.database))
-    walked_set = replace(dataset, queries=tuple(frames), positives=positives)
-    return evaluate_sequence(map_, walked_set, range(len(walk)), rows[walk], WALK)[0]
 
 
 def add_judged(report: Report, what: str, judged: Sequence[Judged]) -> None:

@@ -5,10 +5,7 @@
 Each folder is an evaluation set with coordinates or place labels; without one, it is the folder
 `tower` of PLACEWISE_TEST_DATA. Its descriptors and place models are those of `bench estimates`. The
 queries are estimated without matches, and with those of their first photos. Matched are mutual
-nearest neighbours, or LightGlue's matches.
-
-The peer is the same with kornia's functions in a loop: its mutual nearest neighbours and its RANSAC
-of the fundamental matrix. CPU times are those of one thread.
+nearest neighbours, or LightGlue's matches. CPU times are those of one thread.
 """
 
 from __future__ import annotations
@@ -42,13 +39,8 @@ from shared.matching.detectors import Detector, detect_features, load_detector
 from shared.matching.features import WORKING_SIDE, LocalFeatures
 from shared.matching.lightglue import LightGlueMatcher
 from shared.matching.matchers import Matcher, MutualNearest
-from shared.matching.verification import (
-    MAX_EPIPOLAR_ERROR_PIXELS,
-    MAX_ITERATIONS,
-    verify_matches,
-)
+from shared.matching.verification import verify_matches
 
-PEER_PAIRS = 100
 MAX_FEATURES_MS = 70.0
 MAX_PAIR_MS = 12.0
 MAX_XFEAT_BYTES = 80_000
@@ -107,7 +99,6 @@ def bench(
             matched = MatchedPhotos(features, matcher)
             compare(report, photos, matched)
             add_cost(report, photos.name, matched, seconds)
-            add_peer(report, photos.name, matched)
 
 
 def detect_all(
@@ -165,27 +156,6 @@ def add_cost(report: Report, name: str, matched: MatchedPhotos, seconds: float) 
     report.add(f"{name}: bytes a photo", float(size), "B", at_most=MAX_XFEAT_BYTES)
     report.add(f"{name}: CPU a pair", pair_ms, "ms", at_most=MAX_PAIR_MS)
     report.add(f"{name}: CPU a pair, matching alone", match_ms, "ms")
-
-
-def add_peer(report: Report, name: str, matched: MatchedPhotos) -> None:
-    """Report the CPU time of a pair with kornia's matching and RANSAC."""
-    from kornia.feature import match_mnn
-    from kornia.geometry import RANSAC
-
-    torch.manual_seed(0)
-    ransac = RANSAC("fundamental", MAX_EPIPOLAR_ERROR_PIXELS, max_iter=MAX_ITERATIONS // 10)
-    pairs = list(matched.supports)[:PEER_PAIRS]
-    started = time.process_time()
-    for pair in pairs:
-        tensors = [matched.features[photo] for photo in pair]
-        descriptors = [torch.from_numpy(f.descriptors.astype(np.float32)) for f in tensors]
-        points = [torch.from_numpy(f.working_pixels().astype(np.float32)) for f in tensors]
-        _, indices = match_mnn(*descriptors)
-        if len(indices) >= 8:
-            ransac(points[0][indices[:, 0]], points[1][indices[:, 1]])
-    if pairs:
-        elapsed_ms = 1000 * (time.process_time() - started) / len(pairs)
-        report.add(f"{name}: CPU a pair, kornia in a loop", elapsed_ms, "ms")
 
 
 def _percent(counted: Iterable[bool | None]) -> float:

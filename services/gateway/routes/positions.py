@@ -48,6 +48,7 @@ Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-180, le=180)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Name = Annotated[str, Field(max_length=MAX_NAME)]
+ClockOffset = Annotated[timedelta, Field(ge=timedelta(days=-1), le=timedelta(days=1))]
 
 
 class PhotoHeaderResponse(ResponseModel):
@@ -119,7 +120,7 @@ class DatedPhotoBody(_Finite):
     time_zone_is_known: bool = False
     camera: Name | None = None
     camera_is_unique: bool = False
-    clock_offset: timedelta | None = None
+    clock_offset: ClockOffset | None = None
     latitude: Latitude | None = None
     longitude: Longitude | None = None
     search: SearchBody | None = None

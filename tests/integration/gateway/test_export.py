@@ -81,9 +81,9 @@ def test_local_features_are_exported_in_the_order_of_the_rows(service: Service) 
         member = tar.extractfile("local.features")
         assert member is not None
         data = member.read()
-    service.store.put("queries/exported.features", data)
+    service.store.put("queries/local.features", data)
     features = read_feature_file(
-        service.store, "queries/exported.features", hashlib.sha256(data).hexdigest()
+        service.store, "queries/local.features", hashlib.sha256(data).hexdigest()
     )
     assert features.model.startswith("xfeat@")
     found = [LocalFeatures.decode(bytes(row)) for row in features.rows[:2]]

@@ -23,7 +23,7 @@ from tests.integration.api_with_keys import ADMIN, Door
 from tests.support.problems import problem
 
 IMPORT = "/reconstructions/import"
-BOUNDED_FORMATS = {"binary", "date-time", "uuid"}
+BOUNDED_FORMATS = {"binary", "date-time", "duration", "uuid"}
 CAMERA = {"model": "PINHOLE", "width": 9, "height": 9, "params": [9, 9, 4, 4]}
 POSE = {"camera": 0, "rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}
 

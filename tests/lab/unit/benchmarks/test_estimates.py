@@ -16,13 +16,11 @@ from lab.benchmarks.estimates import (
     DescribedPhotos,
     add_judged,
     add_left_out,
-    add_walks,
     draw,
     fit_and_judge,
     left_out_labels,
 )
 from lab.benchmarks.report import Report
-from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from services.cli.main import build_app
 from shared.errors import Misconfigured
 from shared.evaluation.places.evidence import PhotoLocation
@@ -71,24 +69,6 @@ def test_labelled_queries_calibrate_the_estimates_of_the_others() -> None:
     assert [j.cluster for j in judged] == list(range(PLACES))
     without = fit_and_judge(photos, in_map, photos.is_query)
     assert judged[0].estimate.probabilities != without[0].estimate.probabilities
-
-
-def test_walks_are_tracked_on_floors_of_the_map_and_not_on_floors_that_it_lacks() -> None:
-    photos, report = described(20), Report("estimates")
-    every = [
-        DatasetPhoto(Path(f"{n:03d}.jpg"), "", place=spot.place)
-        for n, spot in enumerate(photos.locations)
-    ]
-    is_query = np.arange(len(every)) % 2 == 1
-    database, queries = (tuple(every[n] for n in np.flatnonzero(m)) for m in (~is_query, is_query))
-    none = (np.zeros(0, np.int64),) * len(queries)
-    dataset = EvaluationSet("house", Path(), database, queries, none, "place-label", "placewise")
-    order = np.argsort(is_query, kind="stable")
-    add_walks(report, dataset, replace(photos, rows=photos.rows[order], is_query=is_query[order]))
-    measured = {figure.what: figure.measured for figure in report.figures}
-    assert measured["house, walks of its queries: tracking"] > 30
-    assert measured["house, walks of its queries: right among them"] > 90
-    assert measured["house, walks on floors left out: tracking"] < 5
 
 
 def test_without_a_folder_the_tower_of_the_test_data_is_measured(
