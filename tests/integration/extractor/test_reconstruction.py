@@ -145,6 +145,7 @@ def test_result_counts_photos_and_components(walk: Walk) -> None:
         "reconstruction_id": str(made.id),
         "photos": PHOTOS - 2,
         "reconstructed": PHOTOS - 2,
+        "left_out": 0,
         "left_out_names": [],
         "components": 1,
         "aligned": 1,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import replace
 from uuid import UUID
 
 import numpy as np
@@ -16,11 +18,14 @@ from services.extractor.geometry.calibrate import (
     propose_coordinates,
 )
 from shared.geodesy import distance_m
+from shared.geometry.component import Component
 from shared.geometry.frames import Alignment, EastNorthUp, Similarity, align, rotation_of_vector
+from shared.matching.features import LocalFeatures
 from shared.matching.matchers import MutualNearest
-from tests.support.reconstructed_scene import ReconstructedScene
+from tests.support.reconstructed_scene import CAMERA, ReconstructedScene, rays_of
 
 COUNT = 10
+SHRINKS = 0.8
 PLANE = EastNorthUp(45.0, 179.99999)
 
 
@@ -30,12 +35,16 @@ def scene() -> ReconstructedScene:
 
 
 def left_out(
-    scene: ReconstructedScene, seconds: np.ndarray, similarity: Similarity | None = None
+    scene: ReconstructedScene,
+    seconds: np.ndarray,
+    similarity: Similarity | None = None,
+    component: Component | None = None,
+    features: Mapping[UUID, LocalFeatures] | None = None,
 ) -> list[LeftOutPose | None]:
     reports: list[int] = []
     found = localise_left_out(
-        scene.component,
-        scene.features,
+        component or scene.component,
+        features or scene.features,
         np.eye(COUNT, dtype=np.float32),
         seconds,
         [500 / 640 if n % 2 else None for n in range(COUNT)],
@@ -58,6 +67,22 @@ def test_photos_are_localised_without_themselves_and_their_neighbours(
     assert 0.2 < calibration.position_68 < 5
     # Within 2 s of each other, no other photo is left for any of them.
     assert left_out(scene, np.linspace(0, 1.9, COUNT)) == [None] * COUNT
+
+
+def test_photos_of_an_imported_camera_are_localised_with_its_rays(
+    scene: ReconstructedScene,
+) -> None:
+    shrunk = {
+        id_: replace(each, positions=np.round(SHRINKS * each.positions).astype(np.uint16))
+        for id_, each in scene.features.items()
+    }
+    rays = rays_of(CAMERA, bytes([7] * 32), SHRINKS)
+    imported = scene.component.with_rays(dict.fromkeys(scene.features, rays))
+    poses = left_out(scene, np.full(COUNT, np.nan), None, imported, shrunk)
+    assert all(pose and pose.distance < 10 * pose.distance_sigma for pose in poses)
+    without_rays = left_out(scene, np.full(COUNT, np.nan))
+    expected = np.median([pose.distance for pose in without_rays if pose])
+    assert np.median([pose.distance for pose in poses if pose]) < 3 * expected
 
 
 def test_errors_of_an_aligned_component_are_horizontal(scene: ReconstructedScene) -> None:
