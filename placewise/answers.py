@@ -153,6 +153,7 @@ class CameraPose(Answer):
     radius_68_m: float | None
     radius_95_m: float | None
     heading_68_degrees: float | None
+    heading_95_degrees: float | None
     enu_quaternion: tuple[float, float, float, float] | None
     reason: str | None
     component: int
@@ -347,6 +348,9 @@ class Component(Answer):
     altitude_m: float | None
     metres_per_unit: float | None
     alignment_rms_m: float | None
+    agreeing: int | None
+    located: int | None
+    is_on_line: bool | None
     not_aligned: str | None
     """why it is not aligned"""
     calibration: dict[str, Any] | None

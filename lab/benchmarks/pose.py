@@ -4,6 +4,8 @@
 
 - Synthetic scenes of pycolmap with 1 px of noise and 30 % of wrong pairs: how many poses are within
   three standard deviations, and within the regions of 68 and 95 %.
+- Streets whose facades repeat, 56 photos each with exact coordinates, beside plain pycolmap with
+  SIFT: horizontal distance of cameras and left-out queries from the truth.
 - A generated city (`lab/city/round_trip.py`), whose camera poses are known: a drive of one summer
   day is the map; queries of a spring and an autumn day, of winter and night are localised without
   knowing their focal length. Coverage is also that with coordinates that are 3 m off.
@@ -21,6 +23,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,6 +39,7 @@ from PIL import Image
 from rich.progress import Progress
 
 from lab.benchmarks.matches import detect_all
+from lab.benchmarks.pose_peer import PeerModel, cpu_seconds
 from lab.benchmarks.report import Report, printed_report
 from lab.city.plan import PlannedPhoto
 from lab.city.round_trip import plan_round_trip
@@ -43,6 +47,7 @@ from lab.city.sessions import AUTUMN, NIGHT, SPRING, WINTER
 from lab.city.write import write_city
 from services.cli.output import JsonOption, Table
 from services.extractor.geometry.calibrate import calibrate, localise_left_out
+from services.extractor.geometry.evidence import fit_to_positions
 from services.extractor.geometry.mapping import PhotoToMap, map_photos, require_pycolmap
 from services.extractor.geometry.matching import match_pairs
 from services.extractor.geometry.pairs import choose_pairs
@@ -62,6 +67,9 @@ CHI_SQUARED = (3.506, 7.815, 14.156)
 """Quantiles at 68, 95 and 99.73 % in three dimensions: the last is that of three deviations"""
 COVERAGE_68, COVERAGE_95 = (63.0, 73.0), (92.0, 98.0)
 COORDINATE_NOISE_M, NOISES = 3.0, 20
+STREETS = (11, 12, 3)
+"""Seeds of round trips"""
+STREET_PHOTOS, STREET_REACH_M, FAR_M = 56, 2.5, 3.0
 PLANE = EastNorthUp(44.07, 8.75)
 WRONG_RADII = 3.0
 """A pose is wrong if it is farther off than so many of its radii of 95 %"""
@@ -91,33 +99,55 @@ class Vlad:
 
 
 class MappedPhotos:
-    """A model of some photos, as the service makes it."""
+    """A model of some photos, as the service makes it.
 
-    def __init__(self, features: Sequence[LocalFeatures], model: str, seconds: Floats) -> None:
+    `positions` (n, 3) are metres in PLANE, if the photos have coordinates.
+    """
+
+    def __init__(
+        self,
+        features: Sequence[LocalFeatures],
+        model: str,
+        seconds: Floats,
+        positions: Floats | None = None,
+    ) -> None:
         self.ids = [UUID(int=number + 1) for number in range(len(features))]
         self.features = dict(zip(self.ids, features, strict=True))
         self.matcher = MutualNearest.of_model(model)
         self.vlad = Vlad(features)
         self.seconds = seconds
-        nowhere = np.full(len(features), np.nan)
-        started = time.perf_counter()
-        pairs = choose_pairs(self.vlad.rows, seconds, nowhere, nowhere)
-        matches = match_pairs(self.features, pairs, self.matcher, lambda _: None)
+        latitudes, longitudes, _ = _coordinates(
+            np.full((len(features), 3), np.nan) if positions is None else positions
+        )
+        started, started_cpu = time.perf_counter(), cpu_seconds()
+        self.pairs = choose_pairs(self.vlad.rows, seconds, latitudes, longitudes)
+        matches = match_pairs(self.features, self.pairs, self.matcher, lambda _: None)
         self.match_seconds = time.perf_counter() - started
         photos = [
-            PhotoToMap(photo, f.width, f.height, f.pixels().astype(np.float32))
-            for photo, f in self.features.items()
+            PhotoToMap(
+                photo,
+                f.width,
+                f.height,
+                f.pixels().astype(np.float32),
+                position=None if positions is None else positions[row],
+            )
+            for row, (photo, f) in enumerate(self.features.items())
         ]
         with TemporaryDirectory(prefix="placewise-bench-") as folder:
             mapped = map_photos(photos, matches, Path(folder), lambda _: None, lambda: None)
         self.seconds_taken = time.perf_counter() - started
+        self.cpu_seconds = cpu_seconds() - started_cpu
         self.components = [each.component for each in mapped]
         self.pose_seconds: list[float] = []
 
+    def best(self, query: LocalFeatures) -> list[int]:
+        """Return the numbers of the most similar photos."""
+        similarities = self.vlad.rows @ self.vlad.describe(query)
+        return [int(row) for row in np.argsort(-similarities, kind="stable")[:CANDIDATES]]
+
     def localise(self, query: LocalFeatures, focal_length: float | None = None) -> Outcome:
         """Localise a photo by its best candidates."""
-        best = np.argsort(-self.vlad.rows @ self.vlad.describe(query), kind="stable")[:CANDIDATES]
-        candidates = [(self.ids[i], self.features[self.ids[i]]) for i in best.tolist()]
+        candidates = [(self.ids[i], self.features[self.ids[i]]) for i in self.best(query)]
         camera = focal_length and Camera.of_focal_length(query.width, query.height, focal_length)
         source = CameraSource.GIVEN if camera else CameraSource.ESTIMATED
         started = time.perf_counter()
@@ -151,6 +181,7 @@ def bench(
     ] = None,
     queries: Annotated[int, typer.Option(min=0, help="City queries by day.")] = 400,
     floors: Annotated[int, typer.Option(min=0, help="Floors that are mapped.")] = 11,
+    streets: Annotated[int, typer.Option(min=0, max=len(STREETS), help="Streets.")] = len(STREETS),
     as_json: JsonOption = False,
 ) -> None:
     """Measure errors, radii, refusals and times of poses."""
@@ -158,6 +189,8 @@ def bench(
     with printed_report("poses", as_json) as (report, progress):
         wrong: list[tuple[str, int, int]] = []
         measure_synthetic(report)
+        if streets:
+            wrong += measure_streets(report, streets, progress)
         if queries:
             wrong += measure_city(report, queries, progress)
         if floors and (folder / "database").is_dir():
@@ -199,6 +232,81 @@ def measure_synthetic(report: Report) -> None:
     _add_coverage(report, "synthetic scenes", float(within_68), float(within_95))
 
 
+def measure_streets(report: Report, count: int, progress: Progress) -> list[tuple[str, int, int]]:
+    """Report streets whose facades repeat, beside plain pycolmap with SIFT; return wrong poses."""
+    columns = ("street", "photos", "m", "over 3 m", "poses", "m", "CPU s")
+    table, detector = Table(*columns, title="streets"), load_detector("xfeat", torch.device("cpu"))
+    wrong = tried = 0
+    for seed in STREETS[:count]:
+        plan = plan_round_trip(seed, [(SPRING, 120)])
+        photos = [photo for photo in plan.photos if photo.role == "database"][:STREET_PHOTOS]
+        truth = np.array([photo.camera.position for photo in photos])
+        queries = [
+            photo
+            for photo in plan.photos
+            if _is_query_of(photo, "spring")
+            and np.linalg.norm(truth - photo.camera.position, axis=1).min() < STREET_REACH_M
+        ]
+        middle = truth.mean(axis=0) * (1, 1, 0)
+        true_queries = np.array([photo.camera.position for photo in queries]) - middle
+        truth = truth - middle
+        bar = progress.add_task(f"street {seed}", total=2 * len(photos + queries))
+        with TemporaryDirectory(prefix="placewise-street-") as name:
+            folder = Path(name, "city")
+            write_city(
+                replace(plan, photos=photos + queries), folder, partial(progress.advance, bar)
+            )
+            paths = [photo.path(folder) for photo in photos + queries]
+            features, _ = detect_all(detector, paths, partial(progress.advance, bar))
+            seconds = 2.0 * np.arange(len(photos), dtype=np.float64)
+            mapped = MappedPhotos(features[: len(photos)], detector.model, seconds, truth)
+            names = [str(path.relative_to(folder)) for path in paths]
+            asked = features[len(photos) :]
+            best = zip(names[len(photos) :], map(mapped.best, asked), strict=True)
+            peer = PeerModel(folder, names[: len(photos)], mapped.pairs, list(best))
+        alignment, component = _align(mapped, truth), mapped.components[0]
+        calibration = mapped.calibrate(0, alignment)
+        outcomes = [mapped.localise(query) for query in asked]
+        posed = [
+            p.position if isinstance(p, LocalPose) and not p.component else None for p in outcomes
+        ]
+        judged = [
+            _judge(pose, alignment, calibration, place)
+            for pose, place in zip(outcomes, true_queries, strict=True)
+            if isinstance(pose, LocalPose) and not pose.component
+        ]
+        rows = [mapped.ids.index(photo) for photo in component.photo_ids]
+        turns = [component.rotation(row) for row in range(len(rows))]
+        ours = (rows, component.centres(), turns, posed, mapped.cpu_seconds)
+        theirs = (peer.rows, peer.centres, peer.rotations, peer.positions, peer.cpu_seconds)
+        for what, (rows, centres, turns, found, cpu) in (
+            (str(seed), ours),
+            ("pycolmap, SIFT", theirs),
+        ):
+            fitted = fit_to_positions(centres, turns, truth[rows])
+            assert fitted is not None
+            has_pose = [n for n, position in enumerate(found) if position is not None]
+            places = np.array([found[n] for n in has_pose]).reshape(-1, 3)
+            off, errors = (
+                np.linalg.norm((fitted.apply(own) - true)[:, :2], axis=1)
+                for own, true in ((centres, truth[rows]), (places, true_queries[has_pose]))
+            )
+            counts = f"{len(rows)} of {len(photos)}", f"{len(has_pose)} of {len(queries)}"
+            middles = f"{np.median(off):.2f}", f"{np.median(errors):.2f}"
+            far = int(np.sum(off > FAR_M))
+            table.add_row(
+                what, counts[0], middles[0], str(far), counts[1], middles[1], f"{cpu:.0f}"
+            )
+            if what == str(seed):
+                report.add(f"street {seed}: photos at a wrong place", far, at_most=0)
+        errors, *radii = np.array([each[:3] for each in judged]).T
+        _add_coverage(report, f"street {seed}", *(100 * float(np.mean(errors <= r)) for r in radii))
+        wrong += int(np.sum(errors > WRONG_RADII * radii[1]))
+        tried += len(judged)
+    report.tables.append(table)
+    return [("photos of streets", wrong, tried)]
+
+
 def measure_city(report: Report, count: int, progress: Progress) -> list[tuple[str, int, int]]:
     """Report the poses of the generated city; return the poses of what should have none."""
     other = count // 4
@@ -217,15 +325,15 @@ def measure_city(report: Report, count: int, progress: Progress) -> list[tuple[s
         panoramas = _detect_changed(detector, [paths[n] for n in by_day[:40]], folder, _panorama)
     members = [n for n, photo in enumerate(plan.photos) if photo.role == "database"]
     seconds = 2.0 * np.arange(len(members), dtype=np.float64)
-    mapped = MappedPhotos([features[n] for n in members], detector.model, seconds)
+    positions = np.array([photo.camera.position for photo in plan.photos])
+    middle = positions[members].mean(axis=0) * (1, 1, 0)
+    truth = positions - middle
+    mapped = MappedPhotos([features[n] for n in members], detector.model, seconds, truth[members])
     report.add("city: photos", len(members))
     report.add("city: photos in the largest component", len(mapped.components[0].photo_ids))
     report.add("city: matched and reconstructed", mapped.seconds_taken, "s")
     per_100 = 100 * mapped.seconds_taken / len(members)
     report.add("city: reconstructed, for each 100 photos", per_100, "s", at_most=300)
-    positions = np.array([photo.camera.position for photo in plan.photos])
-    middle = positions[members].mean(axis=0) * (1, 1, 0)
-    truth = positions - middle
     alignment = _align(mapped, truth[members])
     started = time.perf_counter()
     calibration = mapped.calibrate(0, alignment)
@@ -381,18 +489,25 @@ def _judge(
 
 def _align(mapped: MappedPhotos, truth: Floats) -> Alignment:
     component = mapped.components[0]
-    rows = [mapped.ids.index(photo) for photo in component.photo_ids]
-    places = [PLANE.to_geographic(row) for row in truth[rows]]
+    rows = sorted(range(len(component.photo_ids)), key=lambda row: component.photo_ids[row])
+    numbers = [mapped.ids.index(component.photo_ids[row]) for row in rows]
     found = align(
-        component.centres(),
-        [component.rotation(row) for row in range(len(rows))],
-        np.array([place.latitude for place in places]),
-        np.array([place.longitude for place in places]),
-        np.array([place.altitude_m for place in places]),
+        component.centres()[rows],
+        [component.rotation(row) for row in rows],
+        *_coordinates(truth[numbers]),
         np.full(len(rows), COORDINATE_NOISE_M),
     )
     assert isinstance(found, Alignment), found
     return found
+
+
+def _coordinates(metres: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return latitudes, longitudes and altitudes of (n, 3) metres in PLANE; NaN of NaN."""
+    places = [PLANE.to_geographic(row) for row in metres]
+    latitudes, longitudes, altitudes = np.array(
+        [(place.latitude, place.longitude, place.altitude_m) for place in places]
+    ).T
+    return latitudes, longitudes, altitudes
 
 
 def _noisy_alignments(mapped: MappedPhotos, truth: Floats) -> Iterable[Alignment]:

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Column
 
-from placewise.answers import CoordinateProposal, Reconstruction
+from placewise.answers import Component, CoordinateProposal, Reconstruction
 from placewise.client import Client
 from services.cli.client import client_command, connect, wait_for_job
 from services.cli.ingest.geotags import find_photos
@@ -159,7 +159,7 @@ def _print_reconstruction(made: Reconstruction, result: Json) -> None:
             str(each.points),
             f"{each.mean_reprojection_error_pixels:.2f} px",
             "" if share is None else format_percent(share),
-            escape(each.not_aligned or f"{each.alignment_rms_m:.2f} m from the coordinates"),
+            escape(each.not_aligned or _format_alignment(each)),
         )
     print_table(table)
     print_message(
@@ -169,7 +169,20 @@ def _print_reconstruction(made: Reconstruction, result: Json) -> None:
     for what, meaning in NAMES_MEANING.items():
         if names := result.get(f"{what}_names"):
             shown = ", ".join(names[:MAX_NAMES_SHOWN]) + " ..." * (len(names) > MAX_NAMES_SHOWN)
-            print_note(f"{result[what]} {meaning}: {shown}")
+            why = meaning if made.imported else "photos are in no component"
+            print_note(f"{result[what]} {why}: {shown}")
+
+
+def _shorten(names: list[str]) -> str:
+    return ", ".join(names[:MAX_NAMES_SHOWN]) + " ..." * (len(names) > MAX_NAMES_SHOWN)
+
+
+def _format_alignment(component: Component) -> str:
+    text = (
+        f"{component.alignment_rms_m:.2f} m from the coordinates of {component.agreeing} of "
+        f"{component.located} photos"
+    )
+    return f"{text}; on a line, turned as upright cameras are" if component.is_on_line else text
 
 
 def _apply_proposals(

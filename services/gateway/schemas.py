@@ -231,6 +231,7 @@ class CameraPoseResponse(ResponseModel):
     heading_68_degrees: float | None = Field(
         description="the true heading differs by at most this with a probability of 68 %"
     )
+    heading_95_degrees: float | None = Field(description="the same with 95 %")
     enu_quaternion: tuple[float, float, float, float] | None = Field(
         description="w, x, y, z of the rotation from the camera's axes forward, left and up to "
         "east, north and up, as in OGC GeoPose and ROS"

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from operator import attrgetter
 from typing import Any
+from uuid import UUID
 
 import numpy as np
 from cachetools import LRUCache, cachedmethod
@@ -35,6 +36,7 @@ log = logging.getLogger(__name__)
 
 CACHED_COMPONENT_BYTES = 128_000_000  # of 5,000 photos of 1,000 keypoints and 200 points each
 MAX_CANDIDATES = 20  # photos of the components that the query is matched with
+SAME_FOCAL, SAME_SHAPE = 1e-3, 0.01  # relative differences of photos of one camera
 
 
 class PoseEstimator:
@@ -86,7 +88,7 @@ class PoseEstimator:
                 query[1],
                 candidates,
                 list(components.values()),
-                *_camera(request, query[1], components.values()),
+                *_camera(request, query[1], list(components.values())),
                 MutualNearest.of_model(request.features_model),
                 frozenset(request.leave_out),
             )
@@ -119,37 +121,59 @@ def _size_bytes(component: Component) -> int:
 
 
 def _camera(
-    request: PoseRequest, query: LocalFeatures, components: Iterable[Component]
+    request: PoseRequest, query: LocalFeatures, components: Sequence[Component]
 ) -> tuple[Camera | None, CameraSource]:
     """Return the camera of the query, if it is known, and where it comes from.
 
-    That of a photo of the reconstruction was refined together with it. An imported one has a
-    principal point and distortion, too, so it serves all that it took.
+    Cameras of the reconstruction were refined together with it: that of the query itself, if it is
+    one of its photos; that with the query's `camera_key`, if it was imported; or that of a photo of
+    the same shape and with the same focal length in its EXIF. An imported one has a principal point
+    and distortion, too, which a focal length that is given leaves as they are.
     """
     size = query.width, query.height
-    known = next(filter(None, (_find_camera(request, each) for each in components)), None)
-    if request.focal_length is None:
-        return (known.resized(*size), CameraSource.MAP) if known else (None, CameraSource.ESTIMATED)
-    if known is None or known.rays is None:
-        camera = Camera.of_focal_length(*size, request.focal_length)
-        return camera, CameraSource(request.camera_source)
-    if request.camera_source == CameraSource.GIVEN:
+    known = _find_camera(request, size, components)
+    if request.focal_length is not None and request.camera_source == CameraSource.GIVEN:
+        if known is None or known.rays is None:
+            known = Camera.of_focal_length(*size, request.focal_length)
         return known.resized(*size).with_focal_length(request.focal_length), CameraSource.GIVEN
-    return known.resized(*size), CameraSource.MAP
+    if known is not None:
+        return known.resized(*size), CameraSource.MAP
+    if request.focal_length is None:
+        return None, CameraSource.ESTIMATED
+    camera = Camera.of_focal_length(*size, request.focal_length)
+    return camera, CameraSource(request.camera_source)
 
 
-def _find_camera(request: PoseRequest, component: Component) -> Camera | None:
-    """Return the camera of the query as that of a photo that is left out, or by its key."""
-    for row, photo_id in enumerate(component.photo_ids):
-        if photo_id in request.leave_out:
-            camera: Camera | None = component.cameras[component.camera_numbers[row]]
+def _find_camera(
+    request: PoseRequest, size: tuple[int, int], components: Sequence[Component]
+) -> Camera | None:
+    """Return the camera of the reconstruction that took the query, as far as photos tell it."""
+    cameras: dict[UUID, Camera] = {
+        photo_id: component.cameras[number]
+        for component in components
+        for photo_id, number in zip(
+            component.photo_ids, component.camera_numbers.tolist(), strict=True
+        )
+    }
+    if own := next((cameras[id_] for id_ in request.leave_out if id_ in cameras), None):
+        return own
+    if request.camera_key is not None:
+        key = hash_camera_key(request.camera_key)
+        imported = next(filter(None, (each.find_camera(key) for each in components)), None)
+        if imported is not None and imported.rays is not None:
+            return replace(imported, rays=imported.rays.turned(request.quarter_turns))
+    if request.focal_length is None:
+        return None
+    for candidate in request.candidates:
+        camera = cameras.get(candidate.photo_id)
+        # Other imported cameras have distortions of their own.
+        if camera is None or camera.rays is not None or candidate.focal_length is None:
+            continue
+        shape = camera.width * size[1] / camera.height / size[0]
+        zoom = candidate.focal_length / request.focal_length
+        if abs(shape - 1) < SAME_SHAPE and abs(zoom - 1) < SAME_FOCAL:
             return camera
-    if request.camera_key is None:
-        return None
-    camera = component.find_camera(hash_camera_key(request.camera_key))
-    if camera is None or camera.rays is None:
-        return None
-    return replace(camera, rays=camera.rays.turned(request.quarter_turns))
+    return None
 
 
 def _to_message(pose: LocalPose, number: int, component: PoseComponent) -> ComponentPose:

@@ -37,7 +37,13 @@ class ComponentAlignment(BaseModel):
     similarity: dict[str, Any]
     """`shared.geometry.frames.Similarity.as_json`: from the component to east, north and up"""
     rms_m: float
-    """root of the mean squared distance of the photos' coordinates from the model"""
+    """root of the mean squared distance of the photos that agree from their coordinates"""
+    agreeing: int
+    """photos that agree with their coordinates"""
+    located: int
+    """photos that have coordinates"""
+    is_on_line: bool
+    """whether only upright cameras settle the turn about the line on which the photos are"""
 
 
 class ReconstructedComponent(BaseModel):

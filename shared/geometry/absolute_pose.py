@@ -6,6 +6,7 @@ covariance, so the last steps are done here, in NumPy.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,9 @@ SAMPLED_PAIRS = 400
 """of which poselib finds a start; all refine it"""
 FOCAL_STARTS = (0.55, 0.7, 0.85, 1.05, 1.4, 2.0)
 """Focal lengths in longer sides that are tried if none is known"""
-REFINED_STARTS = 2
+REFINED_STARTS = 3
+FOCAL_TIE_SHARE = 0.9
+"""Focal lengths with such a share of the best one's inliers are as likely"""
 ITERATIONS = 25
 UNKNOWN_FOCAL_SIGMA = 10.0
 """ln: no knowledge at all"""
@@ -79,14 +82,14 @@ def estimate_absolute_pose(
         if info["num_inliers"] >= MIN_PAIRS:
             position = -found.R.T @ found.t
             fits.append(_Fit(pixels, points, covariances, tried, found.R, position))
-    best: _Fit | None = None
-    for fit in sorted(fits, key=lambda fit: fit.cost)[:REFINED_STARTS]:
+    refined = sorted(fits, key=lambda fit: fit.cost)[:REFINED_STARTS]
+    for fit in refined:
         fit.refine(focal_sigma)
-        if best is None or fit.cost < best.cost:
-            best = fit
+    best = min(refined, key=lambda fit: fit.cost, default=None)
     if best is None or best.is_inlier.sum() < MIN_PAIRS:
         return None
-    return best.pose(focal_sigma)
+    enough = FOCAL_TIE_SHARE * best.is_inlier.sum()
+    return best.pose(focal_sigma, [fit for fit in refined if fit.is_inlier.sum() >= enough])
 
 
 class _Fit:
@@ -150,14 +153,22 @@ class _Fit:
             if before[3] - self.cost < 1e-6 * self.cost:
                 break
 
-    def pose(self, focal_sigma: float | None) -> AbsolutePose:
-        """Return the pose; its covariance is that of the inliers, scaled by their errors'."""
+    def pose(self, focal_sigma: float | None, others: Sequence[_Fit]) -> AbsolutePose:
+        """Return the pose; its covariance is that of the inliers, scaled by their errors'.
+
+        The covariance reaches as far as the poses that are as likely: of flat scenes, several focal
+        lengths explain the matches.
+        """
         rows, errors, _ = self._linearise()
         count = len(errors)
         variance = float(np.sum(errors**2)) / max(1, 2 * count - 7)
         normal = np.einsum("mik,mil->kl", rows, rows) / max(variance, 1e-6)
         normal[6, 6] += _prior(focal_sigma)
         covariance = np.linalg.pinv(normal, hermitian=True)
+        apart = [self._difference_from(other) for other in others]
+        if apart:
+            farthest = max(apart, key=lambda each: float(each[:3] @ each[:3]))
+            covariance = covariance + np.outer(farthest, farthest)
         return AbsolutePose(
             self.rotation,
             self.position,
@@ -166,6 +177,15 @@ class _Fit:
             float(np.sqrt(covariance[6, 6])),
             self.is_inlier,
         )
+
+    def _difference_from(self, other: _Fit) -> Floats:
+        """Return the (7,) difference of another fit as the covariance has it."""
+        turn = other.rotation.T @ self.rotation
+        vector = np.array(
+            [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+        )
+        focal = np.log(other.camera.focal_pixels / self.camera.focal_pixels)
+        return np.concatenate([other.position - self.position, vector / 2, [focal]])
 
     def _linearise(self) -> tuple[Floats, Floats, Floats]:
         """Return Jacobian (k, 2, 7), errors (k, 2) and weights (k,) of the inliers.

@@ -21,6 +21,10 @@ MIN_FOCAL_LENGTH, MAX_FOCAL_LENGTH = 0.3, 6.0
 """Plausible focal lengths in longer sides: views of 118 and 10 degrees"""
 
 
+UNKNOWN_FOCAL_LENGTH = 0.9
+"""in longer sides, where a guess is needed: 26 mm of film"""
+
+
 class CameraSource(StrEnum):
     """Where the focal length of a query comes from."""
 

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from shared.geometry.cameras import RAY_TERMS, Camera, Floats, Rays
 
 NO_POINT = -1
+MIN_INFORMATION = 1e-6
+"""Least eigenvalue of a point's information as a share of the largest"""
 NO_TERMS = np.zeros((RAY_TERMS, RAY_TERMS, 2))
 NO_RAYS = Rays(NO_TERMS, 0.0, bytes(32), 0)
 MAX_ZOOM = 1.1
@@ -186,6 +188,26 @@ def _check(arrays: dict[str, NDArray[Any]]) -> None:
         raise ValueError("a camera has no size or focal length")
     if photos and np.abs(np.linalg.norm(arrays["rotations"], axis=1) - 1).max() > 1e-6:
         raise ValueError("a rotation is no unit quaternion")
+
+
+def projection_jacobian(
+    points: Floats, rotation: Floats, translation: Floats, focal_pixels: float
+) -> Floats:
+    """Return the (m, 2, 3) derivatives of the pixels of points (m, 3), without distortion."""
+    seen = points @ rotation.T + translation
+    jacobian = np.zeros((len(points), 2, 3))
+    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1
+    jacobian[:, :, 2] = -seen[:, :2] / seen[:, 2:]
+    found: Floats = jacobian * (focal_pixels / seen[:, 2, None, None]) @ rotation
+    return found
+
+
+def bounded_inverse(information: Floats) -> Floats:
+    """Return the inverses of (p, 3, 3), bounded where a point's distance is hardly known."""
+    values, vectors = np.linalg.eigh(information)
+    values = np.maximum(values, np.maximum(values[:, -1:], 1e-9) * MIN_INFORMATION)
+    found: Floats = vectors / values[:, None, :] @ vectors.transpose(0, 2, 1)
+    return found
 
 
 def rotation_matrix(quaternion: Floats | Sequence[float]) -> Floats:

@@ -19,11 +19,15 @@ from shared.geometry.cameras import Floats
 
 MIN_PHOTOS = 3
 MIN_SPREAD = 0.02
-"""Least extent of photos across their line as a share of that along it"""
+"""Photos that extend less across their line, as a share of that along it, are on a line"""
+MIN_AGREEING_SHARE = 0.75
+"""of the photos with coordinates; where fewer agree, the model is bent or folded"""
 GPS_SIGMA_M = 5.0
 """Expected standard deviation of coordinates in each direction, of a phone in a street"""
 ROLL_SIGMA = math.radians(5)
 """Of upright photos: how far their cameras are turned about the direction in which they look"""
+PITCH_SIGMA = math.radians(15)
+"""Of all photos together: how far they look upwards or downwards in the mean"""
 UNKNOWN_ALTITUDE_SIGMA_M = 10.0
 """Of a photo without an altitude, which is taken to be as high as the others"""
 MAX_TYPICAL_ERROR = 4.0
@@ -33,6 +37,8 @@ MAX_SCALE_SIGMA = 0.3
 SAMPLES = 300
 ITERATIONS = 30
 INLIER_SIGMAS = 3.0
+MIN_NOISE = 0.02
+"""Least noise of coordinates in expected standard deviations: 10 cm of those of a phone"""
 PART = 10
 """Successive photos of a part of a model that may be turned against the others"""
 
@@ -146,6 +152,9 @@ class Alignment:
     """(n,) horizontal distance of each photo with coordinates; NaN without"""
     is_inlier: NDArray[np.bool_]
     """(n,) photos whose coordinates agree with most others"""
+    is_on_line: bool = False
+    """whether photos and coordinates are on a line, about which only upright cameras settle the
+    turn"""
 
 
 def align(
@@ -177,7 +186,7 @@ def align(
     altitudes = altitudes_m[known]
     knows_altitude = bool(np.isfinite(altitudes).sum() >= MIN_PHOTOS)
     middle = float(np.nanmedian(altitudes)) if knows_altitude else 0.0
-    origin = _plane_at(latitudes[known], longitudes[known], middle)
+    origin = plane_at(latitudes[known], longitudes[known], middle)
     is_high = np.isfinite(altitudes) & knows_altitude
     targets = origin.from_geographic(
         latitudes[known], longitudes[known], np.where(is_high, altitudes, middle)
@@ -185,13 +194,11 @@ def align(
     sigmas = np.repeat(sigmas_m[known, None], 3, axis=1)
     sigmas[~is_high, 2] = np.hypot(sigmas[~is_high, 2], UNKNOWN_ALTITUDE_SIGMA_M)
     points = centres[known]
-    rights = np.array([rotations[i][0] for i in known.tolist()])
-    for what, places in (("coordinates", targets[:, :2]), ("reconstructed positions", points)):
-        extents = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
-        if extents[1] <= max(MIN_SPREAD * extents[0], np.abs(places).max() * 1e-9):
-            return f"the {what} of its photos are all on a line"
-    start = _robust_start(points, targets, sigmas)
-    fitted = _refine(start, points, targets, sigmas, rights, knows_altitude)
+    fitted = fit_similarity(
+        points, targets, [rotations[i] for i in known.tolist()], sigmas, knows_altitude
+    )
+    if isinstance(fitted, str):
+        return fitted
     residuals = targets - fitted[0].apply(points)
     distances = np.full(len(centres), np.nan)
     distances[known] = np.linalg.norm(residuals[:, :2], axis=1)
@@ -208,11 +215,61 @@ def align(
         return "its photos are too close to each other for the errors of their coordinates"
     agrees = np.zeros(len(centres), dtype=bool)
     agrees[known] = fitted[1]
+    near = int(np.sum(distances[known] <= INLIER_SIGMAS * sigmas_m[known]))
+    if max(near, agrees.sum()) < MIN_AGREEING_SHARE * len(known):
+        return (
+            f"only {near} of {len(known)} photos agree with their coordinates: the reconstruction "
+            "is bent, or many coordinates are wrong"
+        )
     rms = float(np.sqrt(np.mean(distances[agrees] ** 2)))
-    return Alignment(origin, fitted[0], rms, distances, agrees)
+    is_on_line = _is_on_line(points) or _is_on_line(targets[:, :2])
+    return Alignment(origin, fitted[0], rms, distances, agrees, is_on_line)
 
 
-def _plane_at(latitudes: Floats, longitudes: Floats, altitude_m: float) -> EastNorthUp:
+def fit_similarity(
+    points: Floats,
+    targets: Floats,
+    rotations: Sequence[Floats],
+    sigmas: Floats,
+    knows_altitude: bool,
+) -> tuple[Similarity, NDArray[np.bool_]] | str:
+    """Return the similarity of `align`, and which photos agree with it; or why there is none.
+
+    Args:
+        points: (n, 3) positions in the component, in the order in which they were taken.
+        targets: (n, 3) metres in east-north-up.
+        rotations: of each photo (3, 3), from the component to its camera's axes.
+        sigmas: (n, 3) metres, expected standard deviations of the targets.
+    """
+    for what, places in (("coordinates", targets[:, :2]), ("reconstructed positions", points)):
+        if np.ptp(places, axis=0).max() <= np.abs(places).max() * 1e-9:
+            return f"the {what} of its photos are all the same"
+    axes = np.array(rotations)
+    on_line = _is_on_line(points) or _is_on_line(targets[:, :2])
+    level = _level(axes) if on_line else None
+    start = _robust_start(points, targets, sigmas, level)
+    return _refine(start, points, targets, sigmas, axes, knows_altitude)
+
+
+def _is_on_line(places: Floats) -> bool:
+    extents = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
+    return bool(extents[1] <= MIN_SPREAD * extents[0])
+
+
+def _level(axes: Floats) -> Floats:
+    """Return the (3, 3) rotation that leads from a component to a frame in which z is up.
+
+    Up is where the cameras' right sides (axes[:, 0]) have no part, and their lower edges least.
+    """
+    rights, downs = axes[:, 0], axes[:, 1]
+    _, vectors = np.linalg.eigh(rights.T @ rights - 0.1 * downs.T @ downs)
+    up = vectors[:, 0] * (-1 if float(np.sum(downs @ vectors[:, 0])) > 0 else 1)
+    east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    east /= np.linalg.norm(east)
+    return np.array([east, np.cross(up, east), up])
+
+
+def plane_at(latitudes: Floats, longitudes: Floats, altitude_m: float) -> EastNorthUp:
     """Return the plane at the middle of the places, also around a pole or the antimeridian."""
     earth_centred = geodetic2ecef(latitudes, longitudes, np.zeros(len(latitudes)))
     latitude, longitude, _ = ecef2geodetic(*np.median(earth_centred, axis=1))
@@ -232,22 +289,49 @@ def umeyama(points: Floats, targets: Floats, weights: Floats) -> tuple[float, Fl
     return scale, rotation, target_middle - scale * rotation @ middle
 
 
-def _robust_start(points: Floats, targets: Floats, sigmas: Floats) -> Similarity:
-    """Return the similarity of three photos with the least median error (LMedS)."""
+def _robust_start(
+    points: Floats, targets: Floats, sigmas: Floats, level: Floats | None
+) -> Similarity:
+    """Return the similarity of a few photos with the least median error (LMedS).
+
+    Args:
+        level: of points on a line: the rotation to a frame in which z is up, about which the
+            similarity turns. Otherwise three photos determine the turn.
+    """
     rng = np.random.default_rng(0)
     weights = 1 / sigmas[:, 0] ** 2
     best, least = None, math.inf
     for number in range(SAMPLES + 1):
         rows = np.arange(len(points)) if not number else rng.choice(len(points), 3, replace=False)
-        scale, rotation, translation = umeyama(points[rows], targets[rows], weights[rows])
+        if level is None:
+            fitted = umeyama(points[rows], targets[rows], weights[rows])
+        else:
+            fitted = _umeyama_level(points[rows] @ level.T, targets[rows], weights[rows])
+            fitted = fitted[0], fitted[1] @ level, fitted[2]
+        scale, rotation, translation = fitted
         if not scale > 0:
             continue
         errors = (scale * points @ rotation.T + translation - targets) / sigmas
         error = float(np.median(np.sum(errors**2, axis=1)))
         if error < least:
-            best, least = (scale, rotation, translation), error
+            best, least = fitted, error
     assert best is not None  # scale is 0 only of coinciding points
     return Similarity(*best, np.zeros((7, 7)), targets.mean(axis=0))
+
+
+def _umeyama_level(
+    points: Floats, targets: Floats, weights: Floats
+) -> tuple[float, Floats, Floats]:
+    """Return the weighted similarity that turns about z only, as `umeyama`."""
+    weights = weights / weights.sum()
+    middle, target_middle = weights @ points, weights @ targets
+    plane, target_plane = (
+        (places[:, 0] + 1j * places[:, 1]) for places in (points - middle, targets - target_middle)
+    )
+    square = float(weights @ np.abs(plane) ** 2)
+    factor = complex((weights * plane.conj()) @ target_plane) / max(square, 1e-300)
+    rotation = rotation_of_vector(np.array([0.0, 0.0, np.angle(factor)]))
+    return abs(factor), rotation, target_middle - abs(factor) * rotation @ middle
 
 
 def _refine(
@@ -255,29 +339,36 @@ def _refine(
     points: Floats,
     targets: Floats,
     sigmas: Floats,
-    rights: Floats,
+    axes: Floats,
     knows_altitude: bool,
 ) -> tuple[Similarity, NDArray[np.bool_]]:
     """Return the refined similarity with its covariance, and which photos agree with it."""
     scale, rotation, translation = start.scale, start.rotation, start.translation
-    count = len(points)
     for _ in range(ITERATIONS):
         moved = scale * points @ rotation.T + translation
         pivot = moved.mean(axis=0)
         errors = (targets - moved) / sigmas
         distances = np.linalg.norm(errors[:, :2], axis=1)
         # Rayleigh: the median of two dimensions is 1.1774 standard deviations.
-        noise = max(float(np.median(distances)) / 1.1774, 1e-3)
+        noise = max(float(np.median(distances)) / 1.1774, MIN_NOISE)
         is_inlier = distances <= INLIER_SIGMAS * noise
         jacobian = _similarity_jacobian(moved - pivot) / sigmas[:, :, None]
         jacobian, errors = jacobian[is_inlier] / noise, errors[is_inlier] / noise
         # The height of a photo's right side, z, is 0; a turn t changes it by (t x right) . z.
-        leaning = rights @ rotation.T
-        roll_jacobian = np.zeros((count, 7))
-        roll_jacobian[:, 0], roll_jacobian[:, 1] = leaning[:, 1], -leaning[:, 0]
+        leaning = axes[:, 0] @ rotation.T
+        roll_jacobian = _height_jacobian(leaning)
         roll_weights = 1 / (ROLL_SIGMA * (1 + (leaning[:, 2] / ROLL_SIGMA) ** 2))
-        rows = np.concatenate([jacobian.reshape(-1, 7), roll_jacobian * roll_weights[:, None]])
-        values = np.concatenate([errors.ravel(), -leaning[:, 2] * roll_weights])
+        looking = (axes[:, 2] @ rotation.T).mean(axis=0, keepdims=True)
+        rows = np.concatenate(
+            [
+                jacobian.reshape(-1, 7),
+                roll_jacobian * roll_weights[:, None],
+                _height_jacobian(looking) / PITCH_SIGMA,
+            ]
+        )
+        values = np.concatenate(
+            [errors.ravel(), -leaning[:, 2] * roll_weights, -looking[:, 2] / PITCH_SIGMA]
+        )
         normal = rows.T @ rows + 1e-12 * np.eye(7)
         step = np.linalg.solve(normal, rows.T @ values)
         turn, factor = rotation_of_vector(step[:3]), math.exp(step[6])
@@ -324,6 +415,13 @@ def _likeness_of_neighbours(residuals: Floats) -> float:
     if len(residuals) < 2 * MIN_PHOTOS or not (square := float(np.mean(residuals**2))):
         return 0.0
     return min(0.95, max(0.0, float(np.mean(residuals[1:] * residuals[:-1])) / square))
+
+
+def _height_jacobian(directions: Floats) -> Floats:
+    """Return the (n, 7) derivatives of the heights z of directions (n, 3)."""
+    jacobian = np.zeros((len(directions), 7))
+    jacobian[:, 0], jacobian[:, 1] = directions[:, 1], -directions[:, 0]
+    return jacobian
 
 
 def _similarity_jacobian(offsets: Floats) -> Floats:

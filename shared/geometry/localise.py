@@ -34,8 +34,10 @@ SAME_POSE_DEPTHS, SAME_POSE_COSINE = 0.3, 0.9
 """Two poses are the same within this share of the distance to what is seen, and 26 degrees"""
 PANORAMA_RATIO = 1.95
 PLAUSIBLE_FOCAL_LENGTHS = (0.35, 4.0)
-FOCAL_SIGMAS = {CameraSource.GIVEN: 0.01, CameraSource.EXIF: 0.04, CameraSource.MAP: 0.05}
+FOCAL_SIGMAS = {CameraSource.GIVEN: 0.01, CameraSource.EXIF: 0.04, CameraSource.MAP: 0.01}
 """Relative standard deviation of a focal length by its source"""
+FOCAL_TIE = 1.1
+"""Another focal length contradicts only if it explains so many times as many keypoints"""
 MAX_FOCAL_SIGMAS = 4.0
 """Farther off, a focal length contradicts the one that the matches show"""
 
@@ -209,7 +211,7 @@ def _doubt_focal_length(
 ) -> str | None:
     """Return why the focal length that was used contradicts the matches, in words."""
     free = _estimate(pairs, components, pose.camera, None)
-    if free is None or pairs.keypoints(free) <= pairs.keypoints(pose):
+    if free is None or pairs.keypoints(free) <= FOCAL_TIE * pairs.keypoints(pose):
         return None
     used = pose.camera.focal_length
     off = abs(np.log(free.camera.focal_length / used))

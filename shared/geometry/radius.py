@@ -19,11 +19,15 @@ from shared.geometry.frames import (
 )
 from shared.geometry.localise import LocalPose
 
+CAMERA_MODEL_SIGMA = 0.0035
+"""radians by which rays are off together: of a focal length that is wrong by 1 %, or a principal
+point by 0.25 % of the longer side"""
 NORMAL_68 = (1.0, 1.067)
 NORMAL_95 = (1.96, 1.731)
 """Quantiles of the length of a normal vector over its root mean square: in one dimension, and in
 two of the same standard deviation"""
-NORMAL_68_OF_ANGLE = 0.994
+NORMAL_OF_ANGLE = (0.994, 1.96)
+"""at 68 and 95 %"""
 
 
 class PoseCalibration(BaseModel):
@@ -32,10 +36,14 @@ class PoseCalibration(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     position_68: float = Field(gt=0)
-    """error of the position over its standard deviation"""
+    """error of the position over its standard deviation, to which the floor is added in square"""
     position_95: float = Field(gt=0)
     heading_68: float = Field(gt=0)
     heading_95: float = Field(gt=0)
+    position_floor: float = Field(0.0, ge=0)
+    """standard deviation, in units of the component, of errors that points have in common"""
+    heading_floor: float = Field(0.0, ge=0)
+    """the same of the heading, in radians"""
     share_found: float = Field(ge=0, le=1)
     """of the left-out photos that were found"""
     poses: int = Field(ge=0)
@@ -56,6 +64,7 @@ class GeoPose:
     radius_68_m: float
     radius_95_m: float
     heading_68_degrees: float
+    heading_95_degrees: float
 
 
 def geo_pose(
@@ -64,7 +73,8 @@ def geo_pose(
     """Return a pose on the earth.
 
     The square of a radius is the sum of that of the pose in its component, the calibrated quantile
-    times its standard deviation, and that of the alignment at its position. Heading, pitch and roll
+    times its standard deviation, that of the alignment at its position, and that of the camera
+    model. Heading, pitch and roll
     are relative to north and up at the position itself, not at the origin.
     """
     place = origin.to_geographic(similarity.apply(pose.position))
@@ -72,13 +82,26 @@ def geo_pose(
     turn = origin.axes @ place.axes.T
     rotation = pose.rotation @ similarity.rotation.T @ turn
     to_enu = turn.T @ similarity.rotation
-    sigma = similarity.scale * horizontal_sigma(pose.covariance, to_enu)
-    aligned_68, aligned_95 = normal_radii(similarity.position_covariance(pose.position))
-    heading = heading_sigma(pose.covariance, pose.rotation, to_enu)
+    sigma = similarity.scale * math.hypot(
+        horizontal_sigma(pose.covariance, to_enu), calibration.position_floor
+    )
+    depths = (pose.seen_points - pose.position) @ pose.rotation[2]
+    shift = CAMERA_MODEL_SIGMA * similarity.scale * float(np.median(depths)) if len(depths) else 0.0
+    aligned_68, aligned_95 = normal_radii(
+        similarity.position_covariance(pose.position) + np.eye(3) * shift**2
+    )
+    heading = math.hypot(
+        heading_sigma(pose.covariance, pose.rotation, to_enu), calibration.heading_floor
+    )
     jacobian = _heading_jacobian(rotation) @ turn.T
     turned = float(jacobian @ similarity.covariance[:3, :3] @ jacobian)
-    turned = NORMAL_68_OF_ANGLE * math.sqrt(turned + similarity.drift_radians**2)
-    degrees = math.degrees(math.hypot(calibration.heading_68 * heading, turned))
+    turned = math.sqrt(turned + similarity.drift_radians**2 + CAMERA_MODEL_SIGMA**2)
+    degrees = [
+        math.degrees(math.hypot(factor * heading, normal * turned))
+        for factor, normal in zip(
+            (calibration.heading_68, calibration.heading_95), NORMAL_OF_ANGLE, strict=True
+        )
+    ]
     return GeoPose(
         place.latitude,
         place.longitude,
@@ -87,7 +110,8 @@ def geo_pose(
         tuple(quaternion_of(geopose_rotation(rotation)).tolist()),
         math.hypot(calibration.position_68 * sigma, aligned_68),
         math.hypot(calibration.position_95 * sigma, aligned_95),
-        min(180.0, degrees),
+        min(180.0, degrees[0]),
+        min(180.0, degrees[1]),
     )
 
 

@@ -217,6 +217,8 @@ class PoseCandidate(FeatureReference):
     """The local features of a photo of the map that may show what a query shows."""
 
     photo_id: UUID
+    focal_length: float | None = None
+    """of its EXIF, as a multiple of its longer side"""
 
 
 class PoseComponent(_Message):
@@ -243,7 +245,8 @@ class PoseRequest(_Message):
     focal_length: float | None = Field(None, gt=0, allow_inf_nan=False)
     """as a multiple of the query's longer side; None if it has to be estimated"""
     camera_source: str
-    """where `focal_length` comes from: a `shared.geometry.cameras.CameraSource`"""
+    """where `focal_length` comes from: a `shared.geometry.cameras.CameraSource`. A focal length of
+    EXIF that a candidate has, too, is that of its camera, which was refined with the model"""
     camera_key: str | None = None
     """`PhotoHeader.camera_key` of the query"""
     quarter_turns: int = 0
@@ -273,6 +276,7 @@ class GeographicPose(_Message):
     radius_68_m: float
     radius_95_m: float
     heading_68_degrees: float
+    heading_95_degrees: float
     enu_quaternion: tuple[float, float, float, float]
     """(w, x, y, z) of `shared.geometry.frames.geopose_rotation`"""
 

@@ -144,6 +144,7 @@ POSE: dict[str, Any] = {
     "radius_68_m": 0.42,
     "radius_95_m": 0.9,
     "heading_68_degrees": 1.25,
+    "heading_95_degrees": 2.5,
     "enu_quaternion": [0.83, 0.0, 0.01, 0.56],
     "reason": None,
     "component": 1,

@@ -27,6 +27,9 @@ ALIGNMENT: dict[str, Any] = {
     "origin": (ORIGIN.latitude, ORIGIN.longitude, ORIGIN.altitude_m),
     "similarity": SIMILARITY.as_json(),
     "rms_m": 0.5,
+    "agreeing": 9,
+    "located": 12,
+    "is_on_line": False,
 }
 CALIBRATION = {
     "position_68": 1.5,

@@ -8,7 +8,7 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.geometry.cameras import Camera, Floats
+from shared.geometry.cameras import Camera, Floats, Rays
 from shared.geometry.component import NO_POINT, Component, quaternion_of
 from shared.matching.features import LocalFeatures
 
@@ -25,6 +25,17 @@ def looking(from_: Floats, to: Floats) -> Floats:
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     return np.array([right, np.cross(forward, right), forward])
+
+
+def rays_of(camera: Camera, camera_key: bytes, scale: float = 1.0) -> Rays:
+    """Return the rays of a camera whose pixels are scaled from the top left corner."""
+    size = camera.width, camera.height
+
+    def look(pixels: Floats) -> Floats:
+        plane = (pixels / scale - np.array(size) / 2) / camera.focal_pixels
+        return np.column_stack([plane, np.ones(len(plane))])
+
+    return Rays.fit(look, size, camera.focal_length, camera_key, 0)
 
 
 @dataclass

@@ -11,23 +11,24 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared.geometry.cameras import Camera, CameraSource, Floats
-from shared.geometry.component import Component
-from shared.geometry.frames import Alignment, Similarity
+from shared.geometry.component import Component, bounded_inverse, projection_jacobian
+from shared.geometry.frames import MIN_AGREEING_SHARE, Alignment, Similarity
 from shared.geometry.localise import LocalPose, localise
 from shared.geometry.radius import (
+    NORMAL_95,
     PoseCalibration,
     heading_sigma,
     horizontal_sigma,
     normal_radii,
 )
-from shared.matching.features import LocalFeatures
+from shared.matching.features import FULL_SIDE, WORKING_SIDE, LocalFeatures
 from shared.matching.matchers import Matcher
 
 CANDIDATES = 10
@@ -36,6 +37,10 @@ MAX_PHOTOS = 300
 """Localised for a calibration: of so many, an interval of 68 % is known to 5 percentage points"""
 DISAGREEING_SIGMAS = 3.5
 """Rayleigh: 1 of 450 photos with right coordinates is farther off"""
+AROUND = 8
+"""Photos around one with other coordinates, most of which must agree with the model"""
+MIN_SIGMA_M = 1.0
+"""Least standard deviation of coordinates in each direction"""
 MIN_FACTOR = 0.1
 """Least quantile factor: a radius of 0 is nobody's"""
 
@@ -64,7 +69,7 @@ class CoordinateProposal:
     distance_m: float
     """from the photo's coordinates"""
     radius_95_m: float
-    """of the proposed ones"""
+    """of the proposed ones: with the errors of the alignment and of the photos that agree"""
 
 
 def localise_left_out(
@@ -84,7 +89,8 @@ def localise_left_out(
         features: Of the component's photos.
         descriptors: (n, D) L2-normalised, of the component's photos in their order.
         seconds: (n,) when they were taken; NaN where that is unknown.
-        focal_lengths: (n,) of EXIF, as multiples of the longer side; None without.
+        focal_lengths: (n,) of EXIF, as multiples of the longer side; None without. With one, the
+            camera of a query is that of the model, unless it was imported without a key.
         similarity: Of the component, if it is aligned.
         on_progress: Called with the number of photos that are done; what it raises ends the work.
     """
@@ -97,12 +103,11 @@ def localise_left_out(
         similarities = np.where(near, -np.inf, descriptors @ descriptors[row])
         best = np.argsort(-similarities, kind="stable")[: min(CANDIDATES, int((~near).sum()))]
         photo = component.photo_ids[row]
-        query = features[photo]
-        camera, source = _query_camera(component, row, query, focal_lengths[row])
+        camera, source = _query_camera(component, row, features[photo], focal_lengths[row])
         found = localise(
-            query,
+            _with_noise(component, row, features[photo]),
             [(component.photo_ids[i], features[component.photo_ids[i]]) for i in best.tolist()],
-            [component],
+            [_without(component, np.flatnonzero(near), features)],
             camera,
             source,
             matcher,
@@ -122,13 +127,75 @@ def _query_camera(
     component: Component, row: int, query: LocalFeatures, focal_length: float | None
 ) -> tuple[Camera | None, CameraSource]:
     """Return the camera that a query of the same camera as a photo would have."""
-    camera = component.cameras[component.camera_numbers[row]]
-    if camera.rays is not None and any(camera.rays.camera_key):
-        return camera.resized(query.width, query.height), CameraSource.MAP
+    camera, size = component.cameras[component.camera_numbers[row]], (query.width, query.height)
+    if focal_length if camera.rays is None else any(camera.rays.camera_key):
+        return camera.resized(*size), CameraSource.MAP
     if focal_length is None:
         return None, CameraSource.ESTIMATED
-    camera = Camera.of_focal_length(query.width, query.height, focal_length)
-    return camera, CameraSource.EXIF
+    return Camera.of_focal_length(*size, focal_length), CameraSource.EXIF
+
+
+def _errors(
+    component: Component, row: int, features: LocalFeatures
+) -> tuple[NDArray[np.int32], Floats]:
+    """Return the points that a photo sees, and (m, 2) how far its keypoints are from them.
+
+    In pixels at WORKING_SIDE, undistorted. Keypoints whose ray the camera does not know are left
+    out.
+    """
+    numbers = component.point_numbers[row]
+    camera, is_point = component.cameras[component.camera_numbers[row]], numbers >= 0
+    seen = component.points[numbers[is_point]] @ component.rotation(row).T
+    pixels = camera.undistort(features.pixels()[is_point])
+    errors = pixels - camera.project(seen + component.translations[row])
+    is_known = np.isfinite(errors).all(axis=1)
+    scale = WORKING_SIDE / max(camera.width, camera.height)
+    return numbers[is_point][is_known], errors[is_known] * scale
+
+
+def _with_noise(component: Component, row: int, features: LocalFeatures) -> LocalFeatures:
+    """Return a photo's features as those of another photo from the same place.
+
+    The noise of its keypoints is in its pose in the model, too, and would cancel out. So each gets
+    another one of the same size.
+    """
+    _, errors = _errors(component, row, features)
+    if not len(errors):
+        return features
+    longer = max(features.width, features.height)
+    noise = np.random.default_rng(row).normal(
+        0, np.sqrt(np.mean(errors**2)) * longer / WORKING_SIDE, features.positions.shape
+    )
+    positions = features.positions + noise * FULL_SIDE / (features.width, features.height)
+    return replace(features, positions=np.clip(np.round(positions), 0, FULL_SIDE).astype(np.uint16))
+
+
+def _without(
+    component: Component, rows: NDArray[np.intp], features: Mapping[UUID, LocalFeatures]
+) -> Component:
+    """Return the component with its points where they would be without the keypoints of photos.
+
+    A point is moved by one Gauss-Newton step from where all keypoints have it; cameras stay.
+    """
+    removed = np.zeros((len(component.points), 3, 3))
+    gradients = np.zeros((len(component.points), 3))
+    for row in rows.tolist():
+        seen, errors = _errors(component, row, features[component.photo_ids[row]])
+        jacobian = projection_jacobian(
+            component.points[seen],
+            component.rotation(row),
+            component.translations[row],
+            component.cameras[component.camera_numbers[row]].focal_length * WORKING_SIDE,
+        )
+        np.add.at(removed, seen, jacobian.transpose(0, 2, 1) @ jacobian)
+        np.add.at(gradients, seen, np.einsum("mij,mi->mj", jacobian, errors))
+    changed = np.flatnonzero(removed.any(axis=(1, 2)))
+    covariances, points = component.covariances.copy(), component.points.copy()
+    left = np.linalg.inv(covariances[changed].astype(float)) - removed[changed]
+    inverse = bounded_inverse(left)
+    covariances[changed] = inverse
+    points[changed] -= np.einsum("pij,pj->pi", inverse, gradients[changed])
+    return replace(component, points=points, covariances=covariances)
 
 
 def _compare(
@@ -155,15 +222,23 @@ def _compare(
 def calibrate(poses: Sequence[LeftOutPose | None]) -> PoseCalibration:
     """Return the conformal quantiles of the errors over their expected deviations.
 
+    The expected deviation is that of the pose's covariance and the median one of all, which stands
+    for errors that neighbouring points share: more points do not lessen them.
     They are those of split conformal prediction (Vovk et al. 2005): of n errors the one at
     ceil((n + 1) * level), so that a new photo's error is below it with that probability. Without
     enough poses for a level, the largest error counts, and at least the quantile of a normal
     distribution.
     """
     found = [pose for pose in poses if pose is not None]
-    distances = np.sort([pose.distance / pose.distance_sigma for pose in found])
-    headings = np.sort([pose.heading / pose.heading_sigma for pose in found])
+    position_floor, heading_floor = (
+        float(np.median(sigmas)) if found else 0.0
+        for sigmas in ([p.distance_sigma for p in found], [p.heading_sigma for p in found])
+    )
+    distances = np.sort([p.distance / math.hypot(p.distance_sigma, position_floor) for p in found])
+    headings = np.sort([p.heading / math.hypot(p.heading_sigma, heading_floor) for p in found])
     return PoseCalibration(
+        position_floor=position_floor,
+        heading_floor=heading_floor,
         position_68=_quantile(distances, 0.68, 1.0),
         position_95=_quantile(distances, 0.95, 1.96),
         heading_68=_quantile(headings, 0.68, 1.0),
@@ -223,31 +298,45 @@ def calibrate_components(
 
 
 def propose_coordinates(
-    component: Component, alignment: Alignment, sigmas_m: Floats
+    component: Component, alignment: Alignment, latitudes: Floats, longitudes: Floats
 ) -> list[CoordinateProposal]:
-    """Return proposals for the photos that are farther from their coordinates than expected.
+    """Return proposals for the photos that are farther from their coordinates than the others.
+
+    A group of photos that are off together may be joined wrongly to the model. So there is a
+    proposal only where most photos around agree with the model: those around the photo in the
+    model, and those around its coordinates.
 
     Args:
         alignment: Of the component with the coordinates of its photos, in their order.
-        sigmas_m: (n,) expected standard deviation of the coordinates in each direction.
+        latitudes, longitudes: (n,) degrees of these; NaN without coordinates.
     """
     proposals = []
-    similarity = alignment.similarity
-    for row, centre in enumerate(component.centres()):
-        distance_m = float(alignment.residuals_m[row])
-        covariance = similarity.position_covariance(centre)
-        variance = sigmas_m[row] ** 2 + float(np.trace(covariance[:2, :2])) / 2
-        if not distance_m > DISAGREEING_SIGMAS * math.sqrt(variance):
+    similarity, centres = alignment.similarity, component.centres()
+    sigma_m = max(MIN_SIGMA_M, alignment.rms_m / math.sqrt(2))
+    covariances = [similarity.position_covariance(centre) for centre in centres]
+    sigmas_m = np.sqrt([sigma_m**2 + float(np.trace(c[:2, :2])) / 2 for c in covariances])
+    agrees = alignment.residuals_m <= DISAGREEING_SIGMAS * sigmas_m
+    modelled = similarity.apply(centres)[:, :2]
+    own = alignment.origin.from_geographic(latitudes, longitudes, np.zeros(len(centres)))[:, :2]
+    for row in np.flatnonzero(np.isfinite(alignment.residuals_m) & ~agrees).tolist():
+        shares = []
+        for places in (modelled, own):
+            distances = np.linalg.norm(places - places[row], axis=1)
+            distances[row] = np.nan
+            distances[np.isnan(alignment.residuals_m)] = np.nan
+            around = np.argsort(distances)[: min(AROUND, int(np.isfinite(distances).sum()))]
+            shares.append(float(np.mean(agrees[around])))
+        if min(shares) < MIN_AGREEING_SHARE:
             continue
-        place = alignment.origin.to_geographic(similarity.apply(centre))
+        place = alignment.origin.to_geographic(similarity.apply(centres[row]))
         proposals.append(
             CoordinateProposal(
                 component.photo_ids[row],
                 place.latitude,
                 place.longitude,
                 place.altitude_m if similarity.knows_altitude else None,
-                distance_m,
-                normal_radii(covariance)[1],
+                float(alignment.residuals_m[row]),
+                math.hypot(normal_radii(covariances[row])[1], NORMAL_95[1] * alignment.rms_m),
             )
         )
     return proposals

@@ -60,7 +60,7 @@ from shared.errors import NotFound, Unprocessable
 from shared.geometry.cameras import Floats, Rays, hash_camera_key
 from shared.geometry.colmap_model import ColmapModel
 from shared.geometry.component import Component
-from shared.geometry.frames import GPS_SIGMA_M, Alignment, align
+from shared.geometry.frames import GPS_SIGMA_M, Alignment, align, plane_at
 from shared.geometry.radius import PoseCalibration
 from shared.ids import new_id
 from shared.imaging.photo_header import read_photo_header
@@ -78,7 +78,7 @@ from shared.storage.keys import component_key, matches_key, reconstruction_prefi
 
 PROGRESS_UNITS = 100
 MATCHED, MAPPED = 40, 80  # units of progress after these steps
-MAX_NAMES_REPORTED = 100  # of an imported model: those without a photo, or without a pose
+MAX_NAMES_REPORTED = 100  # photos in no component, names of an imported model without a photo
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,10 +89,10 @@ class MapPhoto:
     features: LocalFeatures
     descriptor: NDArray[np.floating[Any]]
 
-    def to_map(self) -> PhotoToMap:
+    def to_map(self, position: Floats | None) -> PhotoToMap:
         size = self.features.width, self.features.height
         pixels = self.features.pixels().astype(np.float32)
-        return PhotoToMap(self.row.id, *size, pixels, self.row.focal_length)
+        return PhotoToMap(self.row.id, *size, pixels, self.row.focal_length, position)
 
 
 class ReconstructionJob:
@@ -125,10 +125,6 @@ class ReconstructionJob:
         components = self._load_components(made, photos)
         if components is None:
             made, components = self._map(made, photos, matches, model)
-        if model is not None:
-            posed = {id_ for component in components for id_ in component.photo_ids}
-            rows = (photo.row for id_, photo in photos.items() if id_ not in posed)
-            result |= _names_result("left_out", [row.relative_path or row.filename for row in rows])
         self._finish(made, components, photos, result)
 
     def _begin(self) -> Reconstruction:
@@ -196,8 +192,7 @@ class ReconstructionJob:
         pairs = choose_pairs(
             np.array([photo.descriptor for photo in photos.values()], np.float32),
             _seconds(photos.values()),
-            _numbers(photo.row.latitude for photo in photos.values()),
-            _numbers(photo.row.longitude for photo in photos.values()),
+            *_coordinates([photo.row for photo in photos.values()]),
             self._read_sections(photos),
         )
         ids = list(photos)
@@ -263,7 +258,10 @@ class ReconstructionJob:
         model: ColmapModel | None,
     ) -> tuple[Reconstruction, list[Component]]:
         """Reconstruct, and store the components."""
-        to_map = [photo.to_map() for photo in photos.values()]
+        to_map = [
+            photo.to_map(position)
+            for photo, position in zip(photos.values(), _positions(photos.values()), strict=True)
+        ]
         known: dict[UUID, Rays] = {}
         self._progress.update(MATCHED, "map")
 
@@ -389,13 +387,21 @@ class ReconstructionJob:
                 origin=(origin.latitude, origin.longitude, origin.altitude_m),
                 similarity=alignment.similarity.as_json(),
                 rms_m=alignment.rms_m,
+                agreeing=int(alignment.is_inlier.sum()),
+                located=int(np.isfinite(alignment.residuals_m).sum()),
+                is_on_line=alignment.is_on_line,
             )
             stored.append(about.model_copy(update={"alignment": aligned}))
-            sigmas_m = np.full(len(component.photo_ids), GPS_SIGMA_M)
-            for each in propose_coordinates(component, alignment, sigmas_m):
+            rows = [photos[id_].row for id_ in component.photo_ids]
+            for each in propose_coordinates(component, alignment, *_coordinates(rows)):
                 proposals.append(_to_json(each, photos[each.photo].row))
+        left_out = photos.keys() - {id_ for each in components for id_ in each.photo_ids}
+        names = sorted(
+            photos[id_].row.relative_path or photos[id_].row.filename for id_ in left_out
+        )
         result |= {
-            "reconstructed": len({id_ for each in components for id_ in each.photo_ids}),
+            "reconstructed": len(photos) - len(left_out),
+            **_names_result("left_out", names),
             "components": len(stored),
             "aligned": sum(each.alignment is not None for each in stored),
             "proposals": len(proposals),
@@ -462,8 +468,7 @@ def _align(component: Component, photos: Mapping[UUID, MapPhoto]) -> Alignment |
     found = align(
         component.centres()[order],
         [component.rotation(i) for i in order],
-        _numbers(row.latitude for row in rows),
-        _numbers(row.longitude for row in rows),
+        *_coordinates(rows),
         _numbers(row.altitude for row in rows),
         np.full(len(rows), GPS_SIGMA_M),
     )
@@ -471,6 +476,25 @@ def _align(component: Component, photos: Mapping[UUID, MapPhoto]) -> Alignment |
         return f"{found[0].upper()}{found[1:]}."
     back = np.argsort(order)
     return replace(found, residuals_m=found.residuals_m[back], is_inlier=found.is_inlier[back])
+
+
+def _coordinates(rows: Sequence[Photo]) -> tuple[Floats, Floats]:
+    """Return latitudes and longitudes, NaN where one is missing."""
+    return _numbers(row.latitude for row in rows), _numbers(row.longitude for row in rows)
+
+
+def _positions(photos: Iterable[MapPhoto]) -> list[Floats | None]:
+    """Return the photos' coordinates in metres east, north and up in one plane."""
+    rows = [photo.row for photo in photos]
+    latitudes, longitudes = _coordinates(rows)
+    known = np.isfinite(latitudes) & np.isfinite(longitudes)
+    if not known.any():
+        return [None] * len(rows)
+    plane = plane_at(latitudes[known], longitudes[known], 0.0)
+    altitudes = _numbers(row.altitude for row in rows)
+    metres = plane.from_geographic(latitudes, longitudes, np.nan_to_num(altitudes))
+    metres[np.isnan(altitudes), 2] = np.nan
+    return [place if is_known else None for place, is_known in zip(metres, known, strict=True)]
 
 
 def _seconds(photos: Iterable[MapPhoto]) -> Floats:
@@ -496,7 +520,7 @@ def _to_json(proposal: CoordinateProposal, photo: Photo) -> dict[str, Any]:
 
 
 def _names_result(what: str, names: list[str]) -> dict[str, Any]:
-    """Return the fields of a job's result for names of an imported model."""
+    """Return the fields of a job's result for names of photos or of an imported model."""
     return {what: len(names), f"{what}_names": names[:MAX_NAMES_REPORTED]}
 
 

@@ -6,7 +6,9 @@ for photos of any size, and stored at the photos' sizes.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,10 +20,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.extractor.child_process import run_in_child
+from services.extractor.geometry.evidence import without_contradictions
 from services.extractor.geometry.matching import VerifiedMatches
+from services.extractor.geometry.positions import adjust_to_positions, misplaced_photos
 from shared.errors import Misconfigured, Unprocessable
-from shared.geometry.cameras import Camera, Floats, Rays
-from shared.geometry.component import NO_POINT, Component
+from shared.geometry.cameras import UNKNOWN_FOCAL_LENGTH, Camera, Floats, Rays
+from shared.geometry.component import (
+    NO_POINT,
+    Component,
+    bounded_inverse,
+    projection_jacobian,
+)
+from shared.geometry.localise import PLAUSIBLE_FOCAL_LENGTHS
 from shared.matching.features import WORKING_SIDE
 from shared.matching.verification import MAX_EPIPOLAR_ERROR_PIXELS
 
@@ -29,12 +39,12 @@ MIN_MODEL_PHOTOS = 3
 MIN_MODEL_POINTS = 60
 MIN_FOCAL_PHOTOS = 10
 """of a component that tells the focal length of its camera"""
+MAX_CUTS = 3
+"""Times that photos are reconstructed again because the model has some at a wrong place"""
+POOR_SHARE = 0.5
+"""of the photos in the largest component: with less, the focal lengths of EXIF may be wrong"""
 ENOUGH_SHARE = 0.9
 """of the photos in the largest component: a second run would add little"""
-UNKNOWN_FOCAL_LENGTH = 0.9
-"""in longer sides, from which the reconstruction starts: 26 mm of film"""
-MIN_INFORMATION = 1e-6
-"""Least eigenvalue of a point's information as a share of the largest"""
 RANDOM_SEED = 1
 DISTORTION_VECTORS = (("p2", "p1"), ("sx1", "sy1"), ("p0", "p1"), ("s0", "s2"), ("s1", "s3"))
 """Parameters of camera models that are the x and y of a vector in the plane of the photo"""
@@ -51,6 +61,10 @@ class PhotoToMap:
     """(n, 2) positions of its local features"""
     focal_length: float | None = None
     """as a multiple of the longer side; None if EXIF has none"""
+    position: Floats | None = None
+    """(3,) metres east, north and up in a plane of all photos; up is NaN without an altitude"""
+    trusts_focal_length: bool = True
+    """whether the reconstruction begins with `focal_length`"""
     quarter_turns: int | None = 0
     """`PhotoHeader.quarter_turns`; only imports look at it"""
     camera: bytes = bytes(32)
@@ -195,6 +209,7 @@ def _map(
                 )
             return sorted(found.values(), key=lambda model: -model.num_reg_images())
 
+        matches = without_contradictions(photos, matches)
         database = Path(scratch) / "first.db"
         _write_database(pycolmap, photos, matches, database, models)
         rest = {str(photo.id) for photo in photos} - {name for m in models for name in _names(m)}
@@ -206,18 +221,54 @@ def _map(
             extended = run(database, start, rest | set(_names(model)), True)
             found.append(extended[0] if extended else model)
             rest -= set(_names(found[-1]))
-        if len(rest) >= MIN_MODEL_PHOTOS:
-            anew = run(database, "", rest, bool(models))
-            largest = anew[0].num_reg_images() if anew else 0
-            if not models and MIN_FOCAL_PHOTOS <= largest < ENOUGH_SHARE * len(rest):
+        databases = (Path(scratch) / f"{number}.db" for number in itertools.count())
+
+        def attempt(tried: Sequence[PhotoToMap], is_known: bool, names: set[str]) -> list[Any]:
+            path = next(databases)
+            _write_database(pycolmap, tried, matches, path, models)
+            return run(path, "", names, is_known)
+
+        anew: list[Any] = []
+        for cuts in range(MAX_CUTS + 1):
+            if len(rest) < MIN_MODEL_PHOTOS:
+                break
+            anew = attempt(photos, bool(models), rest)
+            if _largest(anew) < POOR_SHARE * len(rest) and any(p.focal_length for p in photos):
+                # A wrong focal length in EXIF leaves no pair to begin with.
+                blind = [replace(photo, trusts_focal_length=False) for photo in photos]
+                for is_known in (False, True):
+                    anew = max(anew, attempt(blind, is_known, rest), key=_registered)
+            if not models and MIN_FOCAL_PHOTOS <= _largest(anew) < ENOUGH_SHARE * len(rest):
                 # Small components can't tell their focal length: they get that of the largest one.
-                database = Path(scratch) / "second.db"
-                _write_database(pycolmap, _with_cameras_of(anew[0], photos), matches, database, [])
-                again = run(database, "", rest, True)
-                if sum(m.num_reg_images() for m in again) > sum(m.num_reg_images() for m in anew):
-                    anew = again
-            found += anew
-        return _write_models(photos, found, folder)
+                again = attempt(_with_cameras_of(anew[0], photos), True, rest)
+                anew = max(anew, again, key=_registered)
+            for each in anew:
+                adjust_to_positions(pycolmap, each, photos)
+            judged = [misplaced_photos(each, photos, matches) for each in anew]
+            wrong = np.any([contradicts for _, contradicts in judged], axis=0)
+            if cuts == MAX_CUTS or not wrong.any():
+                for each, (misplaced, _) in zip(anew, judged, strict=True):
+                    _deregister(each, misplaced)
+                break
+            matches = matches.only(~wrong)
+        plausible = [each for each in anew if _bent_focal_length(each) is None]
+        if anew and not found and not plausible:
+            raise Unprocessable(
+                "empty_model",
+                "No photos could be reconstructed together: their matches agree with a focal "
+                f"length of {_bent_focal_length(anew[0]):.2f} longer sides only, which hardly a "
+                "camera has. Send photos as the camera took them, neither cropped nor with a "
+                "changed perspective.",
+            )
+        return _write_models(photos, found + plausible, folder)
+
+
+def _registered(models: Sequence[Any]) -> int:
+    return sum(model.num_reg_images() for model in models)
+
+
+def _largest(models: Sequence[Any]) -> int:
+    return max((model.num_reg_images() for model in models), default=0)
 
 
 def _pipeline_options(pycolmap: Any, is_focal_length_known: bool) -> Any:
@@ -419,11 +470,12 @@ def _working_pixels(photo: PhotoToMap) -> NDArray[np.float32]:
 
 
 def _working_camera(pycolmap: Any, photo: PhotoToMap, camera_id: int) -> Any:
-    focal = (photo.focal_length or UNKNOWN_FOCAL_LENGTH) * max(photo.width, photo.height)
+    known = photo.focal_length if photo.trusts_focal_length else None
+    focal = (known or UNKNOWN_FOCAL_LENGTH) * max(photo.width, photo.height)
     camera = pycolmap.Camera.create_from_model_name(
         camera_id, "SIMPLE_RADIAL", focal, photo.width, photo.height
     )
-    camera.has_prior_focal_length = photo.focal_length is not None
+    camera.has_prior_focal_length = known is not None
     _resize(camera, _working_scale(camera))
     return camera
 
@@ -490,6 +542,19 @@ def _write_models(
     return errors
 
 
+def _bent_focal_length(model: Any) -> float | None:
+    """Return a focal length of a model, in longer sides, that hardly a camera has: it is bent."""
+    low, high = PLAUSIBLE_FOCAL_LENGTHS
+    found = (c.mean_focal_length() / max(c.width, c.height) for c in model.cameras.values())
+    return next((float(each) for each in found if not low <= each <= high), None)
+
+
+def _deregister(model: Any, names: AbstractSet[str]) -> None:
+    for number in list(model.reg_image_ids()):
+        if model.image(number).name in names:
+            model.deregister_frame(model.image(number).frame_id)
+
+
 def _without_shared_photos(models: Sequence[Any]) -> list[Any]:
     """Return the models, most photos first, each without the photos of those before it.
 
@@ -498,9 +563,7 @@ def _without_shared_photos(models: Sequence[Any]) -> list[Any]:
     disjoint: list[Any] = []
     names: set[str] = set()
     for model in sorted(models, key=lambda model: -model.num_reg_images()):
-        for number in list(model.reg_image_ids()):
-            if model.image(number).name in names:
-                model.deregister_frame(model.image(number).frame_id)
+        _deregister(model, names)
         is_enough = model.num_reg_images() >= MIN_MODEL_PHOTOS
         if is_enough and model.num_points3D() >= MIN_MODEL_POINTS:
             disjoint.append(model)
@@ -533,9 +596,10 @@ def _component_of(
         numbers_of_photos.append(numbers)
         seen = np.unique(numbers[numbers != NO_POINT])
         counts[seen] += 1
-        information[seen] += _point_information(
+        jacobian = projection_jacobian(
             xyz[seen], pose.rotation.matrix(), pose.translation, image.camera.mean_focal_length()
         )
+        information[seen] += jacobian.transpose(0, 2, 1) @ jacobian
     return Component(
         tuple(ids),
         np.array(rotations),
@@ -546,30 +610,9 @@ def _component_of(
             _stored_camera(model.camera(number), scales[number]) for number in sorted(model.cameras)
         ),
         xyz,
-        _inverse(information).astype(np.float32),
+        bounded_inverse(information).astype(np.float32),
         counts,
     )
-
-
-def _point_information(
-    points: Floats, rotation: Floats, translation: Floats, focal: float
-) -> Floats:
-    """Return (m, 3, 3) J^T J of the projections of points by their coordinates, in pixels."""
-    seen = points @ rotation.T + translation
-    jacobian = np.zeros((len(points), 2, 3))
-    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1
-    jacobian[:, :, 2] = -seen[:, :2] / seen[:, 2:]
-    jacobian = jacobian * (focal / seen[:, 2, None, None]) @ rotation
-    found: Floats = jacobian.transpose(0, 2, 1) @ jacobian
-    return found
-
-
-def _inverse(information: Floats) -> Floats:
-    """Return the inverses of (p, 3, 3), bounded where a point's distance is hardly known."""
-    values, vectors = np.linalg.eigh(information)
-    values = np.maximum(values, values[:, -1:] * MIN_INFORMATION)
-    found: Floats = vectors / values[:, None, :] @ vectors.transpose(0, 2, 1)
-    return found
 
 
 def _stored_camera(camera: Any, scale: float) -> Camera:

@@ -35,6 +35,11 @@ class VerifiedMatches:
     keypoints: tuple[NDArray[np.uint16], ...]
     """for each pair (k, 2) keypoints of the first and the second photo"""
 
+    def only(self, chosen: NDArray[np.bool_]) -> VerifiedMatches:
+        """Return the matches of the chosen pairs (m,)."""
+        keypoints = tuple(self.keypoints[n] for n in np.flatnonzero(chosen).tolist())
+        return VerifiedMatches(self.photo_ids, self.pairs[chosen], keypoints)
+
     def encode(self) -> bytes:
         """Encode as a compressed npz."""
         buffer = io.BytesIO()

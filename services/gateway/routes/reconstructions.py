@@ -63,6 +63,9 @@ class ReconstructRequest(RequestModel):
     )
 
 
+FIT = {"agreeing", "located", "is_on_line"}
+
+
 class ComponentResponse(ResponseModel):
     """Photos that were reconstructed together, in a frame of their own."""
 
@@ -79,7 +82,12 @@ class ComponentResponse(ResponseModel):
     altitude_m: float | None = Field(description="null also if its photos have no altitudes")
     metres_per_unit: float | None = Field(description="metres in a unit of its frame")
     alignment_rms_m: float | None = Field(
-        description="root mean square distance between its photos and their coordinates"
+        description="root mean square distance between the photos that agree and their coordinates"
+    )
+    agreeing: int | None = Field(description="photos that agree with their coordinates")
+    located: int | None = Field(description="photos that have coordinates")
+    is_on_line: bool | None = Field(
+        description="whether its photos are on a line: upright cameras settle the turn about it"
     )
     not_aligned: str | None = Field(description="why it is not aligned")
     calibration: dict[str, Any] | None = Field(
@@ -100,6 +108,7 @@ class ComponentResponse(ResponseModel):
             altitude_m=altitude if similarity.get("knows_altitude") else None,
             metres_per_unit=similarity.get("scale"),
             alignment_rms_m=alignment and alignment.rms_m,
+            **(alignment.model_dump(include=FIT) if alignment else dict.fromkeys(FIT)),
         )
 
 

@@ -6,11 +6,14 @@ import logging
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from sqlalchemy import select
+
 from services.gateway.dependencies import GatewayContext
 from services.gateway.schemas import CameraPoseResponse, PoseCameraResponse
 from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import find_feature_rows
 from shared.catalog.maps import Matching
+from shared.catalog.photos import Photo
 from shared.catalog.reconstructions import ReconstructedComponent, current_reconstruction
 from shared.errors import PlacewiseError
 from shared.geometry.cameras import CameraSource
@@ -65,15 +68,23 @@ def find_pose(
         current = current_reconstruction(session, query.map.id)
         if isinstance(current, str):
             return current
-        rows = find_feature_rows(session, query.generation.id, [hit.photo_id for hit in hits])
+        ids = [hit.photo_id for hit in hits]
+        rows = find_feature_rows(session, query.generation.id, ids)
+        stored = select(Photo.id, Photo.focal_length).where(Photo.id.in_(ids))
+        focal_lengths = {row.id: row.focal_length for row in session.execute(stored)}
     components = current.list_components()
     source = CameraSource.ESTIMATED if query.focal_length is None else CameraSource.EXIF
     request = PoseRequest(
         query=query.features,
         candidates=tuple(
-            PoseCandidate(photo_id=photo_id, object_key=rows[photo_id][0], row=rows[photo_id][1])
-            for photo_id in (hit.photo_id for hit in hits)
-            if photo_id in rows
+            PoseCandidate(
+                photo_id=id_,
+                object_key=rows[id_][0],
+                row=rows[id_][1],
+                focal_length=focal_lengths.get(id_),
+            )
+            for id_ in ids
+            if id_ in rows
         ),
         features_model=current.features_model,
         components=tuple(map(_to_message, components)),

@@ -14,7 +14,7 @@ from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Unavailable
 from shared.geodesy import distance_m
-from shared.geometry.cameras import Camera
+from shared.geometry.cameras import Camera, hash_camera_key
 from shared.geometry.component import rotation_matrix
 from shared.ids import new_id
 from shared.matching.features import LocalFeatures
@@ -39,7 +39,7 @@ from tests.support.poses import (
     TURN_DEGREES,
     take_query,
 )
-from tests.support.reconstructed_scene import CAMERA, ReconstructedScene
+from tests.support.reconstructed_scene import CAMERA, ReconstructedScene, rays_of
 from tests.support.search_tier import SearchTier
 
 pytestmark = pytest.mark.databases("sqlite")
@@ -136,6 +136,43 @@ def test_unknown_focal_length_is_estimated_or_that_of_the_same_photo_in_the_reco
     pose = found(backend.estimate_pose(again))
     assert pose.camera_source == "map"
     assert np.linalg.norm(pose.position - scene.component.centres()[2]) < 0.05
+
+
+def test_query_by_a_camera_of_the_reconstruction_has_its_refined_focal_length(
+    backend: SearchBackend, store: FolderStore, scene: ReconstructedScene
+) -> None:
+    wrong = 1.3 * CAMERA.focal_length  # in the EXIF of all photos of this camera
+    request = pose_request(store, scene, focal_length=wrong)
+    same = tuple(one.model_copy(update={"focal_length": wrong}) for one in request.candidates)
+    pose = found(backend.estimate_pose(request.model_copy(update={"candidates": same})))
+    assert pose.camera_source == "map"
+    assert pose.focal_pixels == pytest.approx(CAMERA.focal_pixels, rel=0.02)
+    given = request.model_copy(update={"candidates": same, "camera_source": "given"})
+    response = backend.estimate_pose(given)
+    assert response.pose is None or response.pose.camera_source == "given"
+
+
+@pytest.mark.parametrize(
+    ("key", "source", "expected"),
+    [("camera 1", "exif", "map"), ("camera 2", "exif", "exif"), ("camera 1", "given", "given")],
+)
+def test_camera_of_an_imported_model_serves_queries_with_its_key_alone(
+    backend: SearchBackend,
+    store: FolderStore,
+    scene: ReconstructedScene,
+    key: str,
+    source: str,
+    expected: str,
+) -> None:
+    rays = rays_of(CAMERA, hash_camera_key("camera 1"))
+    imported = scene.component.with_rays(dict.fromkeys(scene.features, rays))
+    request = pose_request(store, scene, camera_key=key, camera_source=source)
+    store.put(COMPONENT_KEY, imported.encode())
+    same = {"focal_length": CAMERA.focal_length}
+    candidates = tuple(one.model_copy(update=same) for one in request.candidates)
+    pose = found(backend.estimate_pose(request.model_copy(update={"candidates": candidates})))
+    assert pose.camera_source == expected
+    assert np.linalg.norm(pose.position - CENTRE) < 0.05
 
 
 def test_component_without_alignment_or_calibration_has_a_pose_without_coordinates(

@@ -117,6 +117,7 @@ def test_photos_are_reconstructed_and_aligned_to_their_coordinates(walk: Walk) -
     alignment = component.alignment
     assert alignment is not None
     assert alignment.rms_m < 0.1
+    assert (alignment.agreeing, alignment.located) == (PHOTOS - 2, PHOTOS - 2)
     found = walk.component(made)
     origin, similarity = (
         EastNorthUp(*alignment.origin),
@@ -144,6 +145,8 @@ def test_result_counts_photos_and_components(walk: Walk) -> None:
         "reconstruction_id": str(made.id),
         "photos": PHOTOS - 2,
         "reconstructed": PHOTOS - 2,
+        "left_out": 0,
+        "left_out_names": [],
         "components": 1,
         "aligned": 1,
         "proposals": 0,

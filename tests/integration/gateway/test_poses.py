@@ -135,7 +135,7 @@ def test_pose_has_coordinates_radii_the_camera_and_the_points_that_were_seen(
     assert pose["altitude_m"] == pytest.approx(place.altitude_m, abs=0.1)
     assert pose["heading"] == pytest.approx((HEADING - TURN_DEGREES) % 360, abs=0.3)
     assert 0 < pose["radius_68_m"] < pose["radius_95_m"] < 0.5
-    assert 0 < pose["heading_68_degrees"] < 1
+    assert 0 < pose["heading_68_degrees"] < pose["heading_95_degrees"] < 2
     w, *_, z = pose["enu_quaternion"]
     assert 2 * math.degrees(math.atan2(z, w)) == pytest.approx(90 - pose["heading"] + 360, abs=0.5)
     assert (pose["component"], pose["reason"]) == (0, None)
@@ -147,7 +147,7 @@ def test_pose_has_coordinates_radii_the_camera_and_the_points_that_were_seen(
     assert (without["pose"], without["no_pose"]) == (None, None)
 
 
-def test_focal_length_is_that_of_the_exif_of_a_query_and_of_a_stored_photo(
+def test_focal_length_is_that_of_the_exif_of_a_query_and_of_the_model_for_its_own_photos(
     service: Service, scene: ReconstructedScene, ids: list[str]
 ) -> None:
     reconstruct(service, scene, ids)
@@ -163,9 +163,10 @@ def test_focal_length_is_that_of_the_exif_of_a_query_and_of_a_stored_photo(
     assert stored["camera"]["source"] == "map"
     assert np.linalg.norm(stored["position"] - scene.component.centres()[2]) < 0.05
     with service.catalog.write() as session:
-        session.get_one(Photo, UUID(ids[2])).focal_length = CAMERA.focal_length
+        session.get_one(Photo, UUID(ids[2])).focal_length = 2 * CAMERA.focal_length
     stored = service.json("POST", path, params={"pose": "true"})["pose"]
-    assert stored["camera"]["source"] == "exif"
+    assert stored["camera"]["source"] == "map"
+    assert stored["camera"]["focal_pixels"] == pytest.approx(CAMERA.focal_pixels, rel=0.05)
 
 
 @pytest.mark.parametrize(

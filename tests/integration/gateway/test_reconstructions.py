@@ -143,6 +143,8 @@ def test_components_say_how_they_are_aligned_and_calibrated_or_why_not(
         altitude,
     )
     assert (first["metres_per_unit"], first["alignment_rms_m"]) == (2.5, 0.5)
+    assert (first["agreeing"], first["located"], first["is_on_line"]) == (9, 12, False)
+    assert (second["agreeing"], second["located"], second["is_on_line"]) == (None, None, None)
     assert (first["not_aligned"], first["calibration"]) == (None, CALIBRATION)
     assert second["not_aligned"] == "No photo has coordinates."
     assert {second[name] for name in ("latitude", "metres_per_unit", "calibration")} == {None}

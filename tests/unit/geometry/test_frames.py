@@ -145,6 +145,31 @@ def test_photos_without_coordinates_do_not_count() -> None:
     assert np.abs(walk.errors(found)).max() < 0.5
 
 
+def test_street_on_a_line_is_turned_about_it_as_upright_cameras_are() -> None:
+    walk = Walk(PLACES["Turin"], noise_m=0.0)
+    line = np.linspace(0, 150, len(walk.enu))[:, None] * [0.6, 0.8, 0.0] + [0, 0, 1.5]
+    walk.enu, walk.centres = line, (line - (10, 20, 5)) @ TURN / walk.scale
+    places = [walk.plane.to_geographic(row) for row in line]
+    walk.latitudes = np.array([place.latitude for place in places])
+    walk.longitudes = np.array([place.longitude for place in places])
+    walk.altitudes = np.array([place.altitude_m for place in places])
+    found = walk.aligned()
+    assert found.is_on_line
+    aside = walk.centres[30] + 20 / walk.scale * TURN[2]  # 20 m above the street
+    height = found.similarity.apply(aside)[2] - found.similarity.apply(walk.centres[30])[2]
+    assert height == pytest.approx(20, abs=0.1)
+
+
+def test_bent_model_is_not_aligned() -> None:
+    walk = Walk(PLACES["Turin"], noise_m=0.5)
+    bend = np.zeros((60, 3))
+    bend[42:] = (60, 30, 0)
+    walk.centres = walk.centres + bend @ TURN / walk.scale
+    found = walk.align()
+    assert isinstance(found, str)
+    assert "agree with their coordinates: the reconstruction is bent" in found
+
+
 @pytest.mark.parametrize("bias", [False, True], ids=["independent errors", "errors of minutes"])
 def test_covariance_contains_the_error_of_the_alignment(bias: bool) -> None:
     squares = []
@@ -166,7 +191,6 @@ def test_covariance_contains_the_error_of_the_alignment(bias: bool) -> None:
     ("change", "reason"),
     [
         ("two", "2 of its photos have coordinates, and 3 are needed"),
-        ("line", "the coordinates of its photos are all on a line"),
         ("same", "its photos are too close to each other for the errors of their coordinates"),
         ("wrong", "from their coordinates: these or the reconstruction are wrong"),
         ("close", "its photos are too close to each other for the errors of their coordinates"),
@@ -176,8 +200,6 @@ def test_reason_why_a_component_is_not_aligned(change: str, reason: str) -> None
     walk = Walk(PLACES["Turin"], noise_m=0.5)
     if change == "two":
         walk.latitudes[2:] = np.nan
-    if change == "line":
-        walk.longitudes[:] = walk.longitudes[0]
     if change == "same":
         walk.longitudes[:], walk.latitudes[:] = walk.longitudes[0], walk.latitudes[0]
     if change == "close":

@@ -51,7 +51,8 @@ def test_pose_has_coordinates_and_calibrated_radii() -> None:
     sigma_m = 2.0 * 0.1 * 2**0.5
     assert found.radius_68_m == pytest.approx(2 * sigma_m)
     assert found.radius_95_m == pytest.approx(4 * sigma_m)
-    assert found.heading_68_degrees == pytest.approx(np.degrees(0.015), rel=0.01)
+    assert found.heading_68_degrees == pytest.approx(np.degrees(np.hypot(0.015, 0.0035)), rel=0.01)
+    assert found.heading_95_degrees > found.heading_68_degrees
 
 
 def test_error_of_the_alignment_is_in_every_radius_and_grows_with_the_distance() -> None:
@@ -111,3 +112,15 @@ def test_turned_component_gives_the_same_pose() -> None:
     assert other.attitude.heading == pytest.approx(one.attitude.heading)
     assert other.radius_95_m == pytest.approx(one.radius_95_m)
     assert other.heading_68_degrees == pytest.approx(one.heading_68_degrees)
+
+
+def test_errors_that_points_share_and_those_of_the_camera_model_are_in_the_radii() -> None:
+    seen = np.array([[40.0, 90.0, 1.0]] * 9)  # 57 units ahead
+    pose = replace(pose_at((0.0, 50.0, 1.0), sigma=1e-4), seen_points=seen)
+    depth_m = 2 * float((seen[0] - pose.position) @ pose.rotation[2])
+    found = geo_pose(pose, HERE, EXACT, CALIBRATION)
+    assert found.radius_68_m == pytest.approx(1.067 * 2**0.5 * 0.0035 * depth_m, rel=0.01)
+    floor = CALIBRATION.model_copy(update={"position_floor": 0.5, "heading_floor": 0.02})
+    wider = geo_pose(pose, HERE, EXACT, floor)
+    assert wider.radius_95_m == pytest.approx(np.hypot(4 * 2 * 0.5, found.radius_95_m), rel=0.01)
+    assert wider.heading_68_degrees > found.heading_68_degrees + 1

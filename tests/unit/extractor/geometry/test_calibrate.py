@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+from dataclasses import replace
 from uuid import UUID
 
 import numpy as np
 import pytest
 
 from services.extractor.geometry.calibrate import (
+    CoordinateProposal,
     LeftOutPose,
     calibrate,
     localise_left_out,
     propose_coordinates,
 )
 from shared.geodesy import distance_m
+from shared.geometry.component import Component
 from shared.geometry.frames import Alignment, EastNorthUp, Similarity, align, rotation_of_vector
+from shared.matching.features import LocalFeatures
 from shared.matching.matchers import MutualNearest
-from tests.support.reconstructed_scene import ReconstructedScene
+from tests.support.reconstructed_scene import CAMERA, ReconstructedScene, rays_of
 
 COUNT = 10
+SHRINKS = 0.8
+PLANE = EastNorthUp(45.0, 179.99999)
 
 
 @pytest.fixture(scope="module")
@@ -27,12 +35,16 @@ def scene() -> ReconstructedScene:
 
 
 def left_out(
-    scene: ReconstructedScene, seconds: np.ndarray, similarity: Similarity | None = None
+    scene: ReconstructedScene,
+    seconds: np.ndarray,
+    similarity: Similarity | None = None,
+    component: Component | None = None,
+    features: Mapping[UUID, LocalFeatures] | None = None,
 ) -> list[LeftOutPose | None]:
     reports: list[int] = []
     found = localise_left_out(
-        scene.component,
-        scene.features,
+        component or scene.component,
+        features or scene.features,
         np.eye(COUNT, dtype=np.float32),
         seconds,
         [500 / 640 if n % 2 else None for n in range(COUNT)],
@@ -57,6 +69,22 @@ def test_photos_are_localised_without_themselves_and_their_neighbours(
     assert left_out(scene, np.linspace(0, 1.9, COUNT)) == [None] * COUNT
 
 
+def test_photos_of_an_imported_camera_are_localised_with_its_rays(
+    scene: ReconstructedScene,
+) -> None:
+    shrunk = {
+        id_: replace(each, positions=np.round(SHRINKS * each.positions).astype(np.uint16))
+        for id_, each in scene.features.items()
+    }
+    rays = rays_of(CAMERA, bytes([7] * 32), SHRINKS)
+    imported = scene.component.with_rays(dict.fromkeys(scene.features, rays))
+    poses = left_out(scene, np.full(COUNT, np.nan), None, imported, shrunk)
+    assert all(pose and pose.distance < 10 * pose.distance_sigma for pose in poses)
+    without_rays = left_out(scene, np.full(COUNT, np.nan))
+    expected = np.median([pose.distance for pose in without_rays if pose])
+    assert np.median([pose.distance for pose in poses if pose]) < 3 * expected
+
+
 def test_errors_of_an_aligned_component_are_horizontal(scene: ReconstructedScene) -> None:
     turn = rotation_of_vector(np.array([0.0, np.pi / 2, 0.0]))  # the scene's x is down
     aligned = Similarity(3.0, turn, np.zeros(3), np.zeros((7, 7)), np.zeros(3))
@@ -70,13 +98,16 @@ def test_errors_of_an_aligned_component_are_horizontal(scene: ReconstructedScene
 
 
 def errors(*ratios: float) -> list[LeftOutPose | None]:
-    return [LeftOutPose(UUID(int=1), ratio, 1.0, 2 * ratio, 1.0) for ratio in ratios]
+    """Return poses whose deviation is 1: half of its square is that of all, the floor."""
+    half = math.sqrt(0.5)
+    return [LeftOutPose(UUID(int=1), ratio, half, 2 * ratio, half) for ratio in ratios]
 
 
 def test_quantiles_are_those_of_conformal_prediction() -> None:
     found = calibrate([*errors(*np.arange(1.0, 100.0)), None])
-    assert (found.position_68, found.position_95) == (68, 95)
-    assert (found.heading_68, found.heading_95) == (136, 190)
+    assert (found.position_68, found.position_95) == pytest.approx((68, 95))
+    assert (found.heading_68, found.heading_95) == pytest.approx((136, 190))
+    assert (found.position_floor, found.heading_floor) == pytest.approx((0.5**0.5, 0.5**0.5))
     assert (found.poses, found.share_found) == (99, 0.99)
 
 
@@ -92,33 +123,35 @@ def test_radius_contains_its_share_of_new_errors() -> None:
 
 def test_few_poses_never_promise_less_than_the_largest_error() -> None:
     found = calibrate(errors(0.5, 4.0))
-    assert (found.position_68, found.position_95) == (4.0, 4.0)
+    assert (found.position_68, found.position_95) == pytest.approx((4.0, 4.0))
     assert calibrate(errors(0.5)).position_95 == 1.96
     nothing = calibrate([None])
     assert (nothing.position_68, nothing.share_found, nothing.poses) == (1.0, 0, 0)
 
 
-def aligned_walk(scene: ReconstructedScene, wrong_m: float) -> tuple[Alignment, EastNorthUp]:
-    """Every unit of the scene is 10 m; photo 4 is `wrong_m` too far north."""
-    plane = EastNorthUp(45.0, 179.99999)
+def proposals_of(scene: ReconstructedScene, wrong_m: dict[int, float]) -> list[CoordinateProposal]:
+    """Every unit of the scene is 10 m; photos are so many metres too far north."""
     metres = 10 * scene.component.centres()
-    metres[4, 1] += wrong_m
-    places = [plane.to_geographic(row) for row in metres]
+    for number, far in wrong_m.items():
+        metres[number, 1] += far
+    places = [PLANE.to_geographic(row) for row in metres]
+    latitudes = np.array([p.latitude for p in places])
+    longitudes = np.array([p.longitude for p in places])
     found = align(
         scene.component.centres(),
-        [scene.component.rotation(row) for row in range(COUNT)],
-        np.array([p.latitude for p in places]),
-        np.array([p.longitude for p in places]),
+        [scene.component.rotation(row) for row in range(len(metres))],
+        latitudes,
+        longitudes,
         np.array([p.altitude_m for p in places]),
-        np.full(COUNT, 3.0),
+        np.full(len(metres), 3.0),
     )
     assert isinstance(found, Alignment), found
-    return found, plane.to_geographic(10 * scene.component.centres()[4])
+    return propose_coordinates(scene.component, found, latitudes, longitudes)
 
 
 def test_coordinates_that_disagree_get_a_proposal(scene: ReconstructedScene) -> None:
-    alignment, right = aligned_walk(scene, wrong_m=50.0)
-    (proposal,) = propose_coordinates(scene.component, alignment, np.full(COUNT, 3.0))
+    (proposal,) = proposals_of(scene, {4: 50.0})
+    right = PLANE.to_geographic(10 * scene.component.centres()[4])
     assert proposal.photo == scene.component.photo_ids[4]
     assert proposal.distance_m == pytest.approx(50, abs=1)
     assert proposal.altitude_m == pytest.approx(right.altitude_m, abs=0.5)
@@ -127,5 +160,9 @@ def test_coordinates_that_disagree_get_a_proposal(scene: ReconstructedScene) -> 
 
 
 def test_coordinates_within_their_expected_error_are_left_alone(scene: ReconstructedScene) -> None:
-    alignment, _ = aligned_walk(scene, wrong_m=8.0)
-    assert propose_coordinates(scene.component, alignment, np.full(COUNT, 3.0)) == []
+    assert proposals_of(scene, {4: 2.0}) == []
+
+
+def test_photos_that_are_off_together_get_no_proposals() -> None:
+    walk = ReconstructedScene(photos=24)
+    assert proposals_of(walk, dict.fromkeys(range(19, 24), 60.0)) == []

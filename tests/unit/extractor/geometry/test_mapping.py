@@ -187,6 +187,28 @@ def test_model_of_another_tool_is_imported_with_its_poses(
         import_model(photos, names, matches, out, source, lambda: None)
 
 
+def test_wrong_focal_length_of_exif_does_not_end_the_reconstruction(
+    scene: ReconstructedScene, tmp_path: Path
+) -> None:
+    photos, matches = everything(scene)
+    wrong = [replace(photo, focal_length=1.6) for photo in photos]  # it is 0.78
+    found = only(map_photos(wrong, matches, tmp_path, lambda _: None, lambda: None)).component
+    assert len(found.photo_ids) >= PHOTOS - 1
+    assert position_errors(found, scene).max() < 0.3
+    assert found.cameras[0].focal_pixels == pytest.approx(1000, rel=0.05)
+
+
+def test_model_has_the_positions_of_its_photos_as_its_frame(
+    scene: ReconstructedScene, tmp_path: Path
+) -> None:
+    photos, matches = everything(scene)
+    truth = dict(zip(scene.component.photo_ids, scene.component.centres(), strict=True))
+    placed = [replace(photo, position=10 * truth[photo.id] + (300, -200, 5)) for photo in photos]
+    found = only(map_photos(placed, matches, tmp_path, lambda _: None, lambda: None)).component
+    expected = np.array([10 * truth[id_] + (300, -200, 5) for id_ in found.photo_ids])
+    assert np.abs(found.centres() - expected).max() < 0.3
+
+
 @pytest.mark.parametrize("is_read_upright", [False, True])
 def test_imported_poses_are_turned_as_exif_turns_the_photos(
     scene: ReconstructedScene, mapped: MappedComponent, tmp_path: Path, is_read_upright: bool

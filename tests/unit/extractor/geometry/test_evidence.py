@@ -1,0 +1,138 @@
+"""Matches and blocks of photos that contradict the photos' coordinates."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from services.extractor.geometry.evidence import find_misplaced, without_contradictions
+from services.extractor.geometry.mapping import PhotoToMap
+from services.extractor.geometry.matching import VerifiedMatches, match_pairs
+from shared.geometry.frames import rotation_of_vector
+from shared.matching.matchers import MutualNearest
+from tests.support.reconstructed_scene import ReconstructedScene, looking
+
+PHOTOS = 12
+STREET_M = 70.0
+"""Between the two streets, whose facades are the same"""
+TURN = rotation_of_vector(np.array([0.2, 0.4, 1.0]))
+
+
+@pytest.fixture(scope="module")
+def scene() -> ReconstructedScene:
+    return ReconstructedScene(photos=PHOTOS)
+
+
+@pytest.fixture(scope="module")
+def matches(scene: ReconstructedScene) -> VerifiedMatches:
+    pairs = np.array([(i, j) for j in range(PHOTOS) for i in range(j)], np.int32)
+    return match_pairs(scene.features, pairs, MutualNearest(0.9), lambda _: None)
+
+
+def photos_at(scene: ReconstructedScene, positions: np.ndarray) -> list[PhotoToMap]:
+    return [
+        PhotoToMap(photo, f.width, f.height, f.pixels().astype(np.float32), 500 / 640, place)
+        for (photo, f), place in zip(scene.features.items(), positions, strict=True)
+    ]
+
+
+def weaker_between_streets(matches: VerifiedMatches) -> VerifiedMatches:
+    """Photos of a repeated facade have fewer matches than those of the same one."""
+    keypoints = tuple(
+        k[:40] if one < PHOTOS // 2 <= other else k
+        for (one, other), k in zip(matches.pairs.tolist(), matches.keypoints, strict=True)
+    )
+    return VerifiedMatches(matches.photo_ids, matches.pairs, keypoints)
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 5.0], ids=["survey", "phone"])
+def test_matches_of_two_streets_that_look_alike_are_dropped(
+    scene: ReconstructedScene, matches: VerifiedMatches, noise_m: float
+) -> None:
+    positions = 3 * scene.component.centres()
+    positions[PHOTOS // 2 :, 1] += STREET_M
+    positions += np.random.default_rng(0).normal(0, noise_m, positions.shape)
+    kept = without_contradictions(photos_at(scene, positions), weaker_between_streets(matches))
+    is_second = kept.pairs >= PHOTOS // 2
+    assert (is_second[:, 0] == is_second[:, 1]).all()
+    assert len(kept.pairs) == sum(1 for _ in combinations(range(PHOTOS // 2), 2)) * 2
+
+
+def test_photo_with_wrong_coordinates_keeps_its_matches(
+    scene: ReconstructedScene, matches: VerifiedMatches
+) -> None:
+    positions = 3 * scene.component.centres()
+    positions[4, 1] += STREET_M
+    kept = without_contradictions(photos_at(scene, positions), matches)
+    assert len(kept.pairs) == len(matches.pairs)
+
+
+def test_photos_without_coordinates_keep_their_matches(
+    scene: ReconstructedScene, matches: VerifiedMatches
+) -> None:
+    photos = [
+        PhotoToMap(p, f.width, f.height, f.pixels().astype(np.float32))
+        for p, f in scene.features.items()
+    ]
+    assert len(without_contradictions(photos, matches).pairs) == len(matches.pairs)
+
+
+class FoldedWalk:
+    """A walk around a corner, in whose model the photos after it are on the first street."""
+
+    def __init__(self, noise_m: float) -> None:
+        first = np.column_stack([np.arange(0, 100, 2.5), np.zeros(40), np.full(40, 1.6)])
+        second = np.column_stack([np.full(12, 100.0), np.arange(40, 70, 2.5), np.full(12, 1.6)])
+        self.places = np.concatenate([first, second])
+        self.modelled = self.places.copy()
+        self.modelled[40:] = first[5:17]
+        self.centres = self.modelled @ TURN / 3
+        ahead = np.concatenate(
+            [np.tile([0.5, 1.0, 0.1], (40, 1)), np.tile([1.0, 0.5, 0.1], (12, 1))]
+        )
+        self.rotations = [
+            looking(place, place + way) @ TURN
+            for place, way in zip(self.places, ahead, strict=True)
+        ]
+        self.seen = self.places + np.random.default_rng(1).normal(0, noise_m, self.places.shape)
+        self.pairs = np.array(
+            [(i, j) for j in range(52) for i in range(max(0, j - 4), j)]
+            + [(i - 35, i) for i in range(40, 52)],
+            np.int32,
+        )
+        self.counts = np.where(np.diff(self.pairs)[:, 0] > 4, 40, 200)
+
+    def misplaced(self) -> tuple[set[int], np.ndarray]:
+        """Return the misplaced photos, and the pairs that led there."""
+        photos, pairs = find_misplaced(
+            self.centres, self.rotations, self.seen, self.pairs, self.counts
+        )
+        return set(np.flatnonzero(photos).tolist()), self.pairs[pairs]
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 5.0], ids=["survey", "phone"])
+def test_photos_on_the_wrong_street_are_found_with_the_matches_that_led_there(
+    noise_m: float,
+) -> None:
+    misplaced, pairs = FoldedWalk(noise_m).misplaced()
+    assert set(range(43, 52)) <= misplaced <= set(range(38, 52))
+    assert len(pairs) >= 9
+    assert (np.diff(pairs) == 35).all()
+
+
+def test_single_photo_on_the_wrong_street_is_found() -> None:
+    walk = FoldedWalk(1.0)
+    walk.centres = walk.places @ TURN / 3
+    walk.centres[51] = walk.places[16] @ TURN / 3
+    misplaced, pairs = walk.misplaced()
+    assert (misplaced, pairs.tolist()) == ({51}, [[16, 51]])
+
+
+def test_wrong_coordinates_of_single_photos_are_no_wrong_places() -> None:
+    walk = FoldedWalk(1.0)
+    walk.centres = walk.places @ TURN / 3
+    walk.seen[[5, 20, 33], 1] += 80
+    misplaced, pairs = walk.misplaced()
+    assert (misplaced, len(pairs)) == (set(), 0)
