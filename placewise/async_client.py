@@ -439,13 +439,15 @@ class AsyncClient(AsyncTransport):
         path = f"/generations/{generation_id}/descriptors"
         await self._download(path, file, on_received, **({"features": True} if features else {}))
 
-    async def reconstruct(self, *, anew: bool = False) -> answers.Started:
+    async def reconstruct(self, *, from_scratch: bool = False) -> answers.Started:
         """Start reconstructing the map's photos, or registering new ones into its reconstruction.
 
         Args:
-            anew: Reconstruct all photos again.
+            from_scratch: Reconstruct all photos again.
         """
-        return answers.Started(**await self._call("POST", "/reconstructions", json={"anew": anew}))
+        return answers.Started(
+            **await self._call("POST", "/reconstructions", json={"from_scratch": from_scratch})
+        )
 
     async def import_reconstruction(self, model: Json) -> answers.Started:
         """Start using the cameras and poses of a COLMAP model for the map's photos.

@@ -72,10 +72,10 @@ def reconstruct(
             help="With --import: upload the photos of this folder first.",
         ),
     ] = None,
-    anew: Annotated[
+    from_scratch: Annotated[
         bool,
         typer.Option(
-            "--anew",
+            "--from-scratch",
             help="Reconstruct all photos again, instead of adding new ones to the present model.",
         ),
     ] = False,
@@ -96,12 +96,12 @@ def reconstruct(
     Photos that show the same are reconstructed together and aligned to their coordinates. A later
     run adds the photos that are new. Interrupted, it goes on from its last step.
     """
-    options = {"--import": model, "--images": images, "--anew": anew}
+    options = {"--import": model, "--images": images, "--from-scratch": from_scratch}
     given = [name for name, value in options.items() if value]
-    if (images and not model) or (proposals and given) or (model and anew):
+    if (images and not model) or (proposals and given) or (model and from_scratch):
         raise InvalidRequest(
             "options_contradict",
-            "--images goes with --import; --anew and --proposals go with no other option.",
+            "--images goes with --import; --from-scratch and --proposals go with no other option.",
         )
     poses = read_colmap_model(model) if model else None  # fails before anything is uploaded
     if model and (model / "images.bin").exists() and (model / "images.txt").exists():
@@ -117,7 +117,7 @@ def reconstruct(
         if images is not None:
             photos = find_photos(images, None, None, places_by_folder=False)
             print_failures(upload_photos(client, photos, progress), "refused", "failed")
-        job = wait_for_job(client, _start(client, poses, anew), progress, "reconstructing")
+        job = wait_for_job(client, _start(client, poses, from_scratch), progress, "reconstructing")
         made = client.reconstruction()
     if as_json:
         print_json({**made.as_json(), "result": job.result})
@@ -129,12 +129,12 @@ def reconstruct(
         print_note(f"The coordinates of {made.proposals} photos disagree with it: {command}")
 
 
-def _start(client: Client, poses: ColmapModel | None, anew: bool) -> UUID:
+def _start(client: Client, poses: ColmapModel | None, from_scratch: bool) -> UUID:
     """Start the job; without a model, return one that is running, as this command has left it."""
     if poses is not None:
         return client.import_reconstruction(poses.model_dump(mode="json")).job_id
     try:
-        return client.reconstruct(anew=anew).job_id
+        return client.reconstruct(from_scratch=from_scratch).job_id
     except Conflict as error:
         if error.code != "reconstruction_running":
             raise

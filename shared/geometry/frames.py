@@ -378,7 +378,7 @@ def _refine(
             break
     moved = scale * points @ rotation.T + translation
     residuals = (targets - moved)[is_inlier, :2]
-    alike = _likeness_of_neighbours(residuals)
+    alike = _lag1_autocorrelation(residuals)
     variance = float(np.mean(residuals**2))
     found = Similarity(
         scale,
@@ -387,13 +387,13 @@ def _refine(
         np.linalg.inv(normal) * (1 + alike) / (1 - alike),
         moved.mean(axis=0),
         math.sqrt(variance * alike),
-        _turn_of_parts(moved[is_inlier, :2], residuals, variance * (1 - alike)),
+        _rotation_deviation(moved[is_inlier, :2], residuals, variance * (1 - alike)),
         knows_altitude,
     )
     return found, is_inlier
 
 
-def _turn_of_parts(positions: Floats, residuals: Floats, variance: float) -> float:
+def _rotation_deviation(positions: Floats, residuals: Floats, variance: float) -> float:
     """Return the standard deviation of the turns that fit the residuals of PART successive photos.
 
     `variance` is that of residuals which are not alike, and turns parts as well.
@@ -410,7 +410,7 @@ def _turn_of_parts(positions: Floats, residuals: Floats, variance: float) -> flo
     return math.sqrt(max(0.0, float(np.mean(squares) - np.mean(expected)))) if squares else 0.0
 
 
-def _likeness_of_neighbours(residuals: Floats) -> float:
+def _lag1_autocorrelation(residuals: Floats) -> float:
     """Return the correlation of (n, 2) residuals with their successors, from 0 to 0.95."""
     if len(residuals) < 2 * MIN_PHOTOS or not (square := float(np.mean(residuals**2))):
         return 0.0

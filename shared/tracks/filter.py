@@ -73,7 +73,7 @@ from shared.tracks.photo_graph import (
 )
 from shared.tracks.state import TrackState, follows_sequence, next_status, track_state
 
-CARRIED_AWAY = 0.002
+KIDNAPPING_RATE = 0.002
 """Probability per frame that the camera goes on at any place of the map"""
 LEAVING = 0.002
 """Probability per frame that the camera leaves the map"""
@@ -267,7 +267,7 @@ class TrackFilter:
         own = before.probabilities[rows]
         elsewhere = before.elsewhere + float(before.probabilities.sum() - own.sum())
         density = elsewhere / max(count - len(own), 1)
-        carried = max(CARRIED_AWAY * weight, 1 - MAX_REACH_M / max(reach_m, MAX_REACH_M))
+        carried = max(KIDNAPPING_RATE * weight, 1 - MAX_REACH_M / max(reach_m, MAX_REACH_M))
         leaving, entering = LEAVING * weight, ENTERING * weight
         stay = max(0.0, 1 - carried - leaving)
         inside = 1 - before.outside

@@ -119,8 +119,8 @@ def test_exported_model_is_one_that_can_be_imported(walk: ServerProcess) -> None
     "options",
     [
         ("--images", "photos"),
-        ("--anew", "--import", "photos"),
-        ("--proposals", "list", "--anew"),
+        ("--from-scratch", "--import", "photos"),
+        ("--proposals", "list", "--from-scratch"),
     ],
 )
 def test_options_that_contradict_are_refused(walk: ServerProcess, options: tuple[str, ...]) -> None:

@@ -232,11 +232,11 @@ class ReconstructionJob:
             return None
 
     def _find_extendable(self, photos: dict[UUID, MapPhoto]) -> Reconstruction | None:
-        """Return the reconstruction that new photos are registered into; None to make all anew.
+        """Return the reconstruction to extend by new photos; None to start from scratch.
 
         It can't be extended after one of its photos was deleted, or has got other keypoints.
         """
-        if self._job.params["anew"]:
+        if self._job.params["from_scratch"]:
             return None
         with self._catalog.read() as session:
             current = current_reconstruction(session, self._job.map_id)

@@ -56,7 +56,7 @@ TAR_RESPONSE: dict[int | str, dict[str, Any]] = {
 
 
 class ReconstructRequest(RequestModel):
-    anew: bool = Field(
+    from_scratch: bool = Field(
         False,
         description="Reconstruct all photos again. By default, new photos are registered into the "
         "map's reconstruction.",
@@ -165,8 +165,10 @@ def start_reconstruction(
     photos. Queries with `pose=true` then have a pose. The job's `result` counts photos and
     components; a job that is interrupted continues from its last step.
     """
-    anew = options is not None and options.anew
-    return _queue(gateway, query.map, idempotent, {"object_key": None, "anew": anew})
+    from_scratch = options is not None and options.from_scratch
+    return _queue(
+        gateway, query.map, idempotent, {"object_key": None, "from_scratch": from_scratch}
+    )
 
 
 @router.post(
@@ -186,7 +188,7 @@ def start_import(
     """
     key = new_checkpoint_key()
     gateway.store.put(key, model.model_dump_json().encode())
-    return _queue(gateway, query.map, idempotent, {"object_key": key, "anew": True})
+    return _queue(gateway, query.map, idempotent, {"object_key": key, "from_scratch": True})
 
 
 def _queue(

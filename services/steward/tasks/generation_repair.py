@@ -33,7 +33,7 @@ from shared.storage.chunks import CORRUPT, read_chunk
 log = logging.getLogger(__name__)
 
 MAX_REPAIRED_CHUNKS = 10  # per model change; with more, the store itself is faulty
-REPAIRED_PARAM = "mended_chunks"
+REPAIRED_PARAM = "repaired_chunks"
 """Key in the params of a model change: the number of chunks described again."""
 
 

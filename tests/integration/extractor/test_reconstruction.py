@@ -211,7 +211,7 @@ def test_later_run_registers_new_photos_with_what_is_known_of_the_others(
     second = walk.reconstruct()
     assert second.id != first.id
     assert set(walk.component(second).photo_ids) == set(walk.ids)
-    third = walk.reconstruct(anew=True)
+    third = walk.reconstruct(from_scratch=True)
     assert {*walk.ids[3:], *new} == set(walk.component(third).photo_ids)
 
 

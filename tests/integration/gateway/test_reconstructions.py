@@ -49,10 +49,13 @@ def add(service: Service, **columns: Any) -> Reconstruction:
 def test_reconstruction_is_a_job_of_which_a_map_has_one_at_a_time(
     service: Service, ids: list[UUID]
 ) -> None:
-    started = service.json("POST", "/reconstructions", 202, json={"anew": True})
+    started = service.json("POST", "/reconstructions", 202, json={"from_scratch": True})
     with service.catalog.read() as session:
         job = session.get_one(Job, UUID(started["job_id"]))
-        assert (job.kind, job.params) == (JobKind.RECONSTRUCT, {"object_key": None, "anew": True})
+        assert (job.kind, job.params) == (
+            JobKind.RECONSTRUCT,
+            {"object_key": None, "from_scratch": True},
+        )
     (listed,) = service.json("GET", "/jobs", params={"kind": "reconstruct"})["jobs"]
     assert (listed["label"], listed["state"]) == ("Reconstruction", "queued")
     again = problem(service("POST", "/reconstructions"), 409, "reconstruction_running")
@@ -90,7 +93,7 @@ def test_imported_model_is_stored_until_its_job_has_ended(
     started = service.json("POST", "/reconstructions/import", 202, json=COLMAP)
     with service.catalog.read() as session:
         params = session.get_one(Job, UUID(started["job_id"])).params
-    assert params["anew"]
+    assert params["from_scratch"]
     stored = ColmapModel.model_validate_json(service.store.get(params["object_key"]))
     assert stored == ColmapModel.model_validate(COLMAP)
 

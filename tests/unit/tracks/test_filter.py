@@ -18,9 +18,9 @@ from shared.tracks import photo_graph
 from shared.tracks.belief import START_GAIN, Belief
 from shared.tracks.evidence import FrameEvidence, Hit, Odometry, PositionFix
 from shared.tracks.filter import (
-    CARRIED_AWAY,
     CHANCE_GAIN,
     ENTERING,
+    KIDNAPPING_RATE,
     LEAVING,
     MAX_GAIN,
     NEWS_WEIGHT,
@@ -72,7 +72,7 @@ def brute_force(frames: list[FrameEvidence]) -> NDArray[np.float64]:
     for step in range(len(frames)):
         move = np.zeros((COUNT + 1, COUNT + 1))
         carried, leaving, entering = (
-            rate * new[step] for rate in (CARRIED_AWAY, LEAVING, ENTERING)
+            rate * new[step] for rate in (KIDNAPPING_RATE, LEAVING, ENTERING)
         )
         # A first frame moves nothing: all photos are equally probable before it.
         kernel = np.exp(-0.5 * ((east - 2.0 * new[step] * velocities[step]) / width) ** 2)
