@@ -282,7 +282,7 @@ def test_doctor_finds_the_running_server(server: ServerProcess, placewise: Comma
     assert set(findings) == {
         *("versions", "settings", "folder", "permissions", "device", "memory", "extractor"),
         *("server", "server catalog", "server object store", "server search"),
-        *("server extractors", "server uploads"),
+        *("server extractors", "server queue", "server uploads"),
     }
     assert all(finding["ok"] for finding in findings.values()), findings
     assert "1 in the map default" in findings["server extractors"]["detail"], "cut-off.jpg"

@@ -30,7 +30,9 @@ def taken(number: int, seconds: float, latitude: float | None = None) -> bytes:
     exif = Image.Exif() if latitude is None else exif_with_position(latitude, LONGITUDE)
     exif[Base.Model] = "Camera"
     clock = NOON + timedelta(seconds=seconds)
-    exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = f"{clock:%Y:%m:%d %H:%M:%S}"
+    details = exif.get_ifd(IFD.Exif)
+    details[Base.DateTimeOriginal] = f"{clock:%Y:%m:%d %H:%M:%S}"
+    details[Base.BodySerialNumber] = "1"  # all photos are of one camera
     return encoded(photo_image(number), "JPEG", quality=90, exif=exif)
 
 

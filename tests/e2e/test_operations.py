@@ -42,7 +42,9 @@ def test_probes_and_health_say_that_every_part_works(server: ServerProcess) -> N
     body = got(server.client.get(f"{API}/health"))
     assert body["status"] == "healthy"
     assert body["uptime_seconds"] > 0
-    assert set(body["parts"]) == {"catalog", "object_store", "search", "extractors", "uploads"}
+    assert set(body["parts"]) == {
+        *("catalog", "object_store", "search", "extractors", "queue", "uploads"),
+    }
     assert {part["status"] for part in body["parts"].values()} == {"healthy"}
 
 

@@ -17,6 +17,7 @@ deep-visual-geo-localization-benchmark)
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -121,6 +122,13 @@ def _pair_seasons(before: Sequence[DatasetPhoto], after: Sequence[DatasetPhoto])
         best, paired_by = ((), ()), "their positions in the sorted folders"
     else:
         paired_by = "the number in their names"
+        first, *others = sorted({*best[0], *best[1]})
+        # Names may count in tens or in milliseconds; a rule counts frames.
+        step = math.gcd(*(number - first for number in others)) or 1
+        best = (
+            tuple((number - first) // step for number in best[0]),
+            tuple((number - first) // step for number in best[1]),
+        )
     numbered = _number(before, best[0]), _number(after, best[1])
     return ListedSet(*numbered, SAME_INDEX_RULE, paired_by=paired_by)
 

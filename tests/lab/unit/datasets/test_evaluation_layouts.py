@@ -361,6 +361,13 @@ def test_seasons_are_paired_by_the_numbers_in_their_names_where_both_have_them(
     assert paired_by in (open_evaluation_set(tmp_path).paired_by or "")
 
 
+def test_a_rule_counts_frames_where_the_names_of_seasons_count_in_tens(tmp_path: Path) -> None:
+    write_photos(tmp_path / "summer", [f"{10 * number:05d}.png" for number in range(6)])
+    write_photos(tmp_path / "winter", [f"{10 * number:05d}.png" for number in (1, 2, 4)])
+    found = rows(open_evaluation_set(tmp_path, rule="frames 1"))
+    assert found == [[0, 1, 2], [1, 2, 3], [3, 4, 5]]
+
+
 @pytest.mark.parametrize(
     ("truth", "code"),
     [
