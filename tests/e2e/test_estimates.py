@@ -201,7 +201,7 @@ def test_more_photos_than_an_estimate_looks_at_are_answered(server: ServerProces
 
 def test_a_map_that_has_grown_is_evaluated_by_itself(server: ServerProcess) -> None:
     numbers = [next(fresh) for _ in range(AUTOMATIC)]
-    fill(server, "grown", numbers, *({"latitude": 0, "longitude": n} for n in range(AUTOMATIC)))
+    fill(server, "grown", numbers, *({"latitude": 1, "longitude": n} for n in range(AUTOMATIC)))
     deadline = time.monotonic() + 60
     found: list[Any] = []
     while not found:
