@@ -39,13 +39,11 @@ def percent(probability: float) -> str:
     return f"{100 * probability:.1f} %"
 
 
-BANDS = [
-    "Within 25 m",
-    "25 m to 100 m away",
-    "100 m to 500 m away",
-    "500 m to 2 km away",
-    "Farther away, or not in this map",
-]
+def bands(levels: list[dict[str, Any]]) -> list[str]:
+    """The names of the bars: the whole map ends the levels that are smaller than it."""
+    circles = ["Within 25 m", "25 m to 100 m away", "100 m to 500 m away", "500 m to 2 km away"]
+    whole = "Elsewhere in this map" if len(levels) > 1 else "In this map"
+    return [*circles[: len(levels) - 1], whole, "Not in this map"]
 
 
 @pytest.mark.parametrize("number", range(4))
@@ -61,7 +59,7 @@ def test_each_level_and_each_match_has_its_probability(
         expect(page.locator(".levels, .rings")).to_have_count(0)
     else:
         rows = page.locator(".levels li")
-        expect(rows.locator(".level")).to_have_text(BANDS)
+        expect(rows.locator(".level")).to_have_text(bands(estimate["levels"]))
         bounds = [round(100 * probability) for probability in [0, *probabilities, 1]]
         shares = [after - before for before, after in itertools.pairwise(bounds)]
         expect(rows.locator(".figure")).to_have_text([f"{share} %" for share in shares])
