@@ -118,7 +118,7 @@ def test_labels_can_be_set_to_names_and_back_to_automatic(visitor: Visitor, town
 
 def test_status_shows_the_parts_the_map_and_the_newest_jobs(visitor: Visitor, town: Town) -> None:
     page = visitor.visit("status")
-    expect(page.locator(".parts li")).to_have_count(5)
+    expect(page.locator(".parts li")).to_have_count(6)
     expect(page.locator(".card .chip.healthy")).to_have_text("healthy")
     photos = town.get("/database/stats")["total_images"]
     expect(page.locator(".tile").first).to_contain_text(str(photos))

@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import poselib
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from services.extractor.geometry.matching import VerifiedMatches
 from shared.geometry.cameras import UNKNOWN_FOCAL_LENGTH, Floats
@@ -216,10 +214,12 @@ def _is_off(offsets: Floats) -> NDArray[np.bool_]:
 def _has_size(is_off: NDArray[np.bool_], one: Any, other: Any) -> NDArray[np.bool_]:
     """Return the photos that are in a group of MIN_BLOCK matched ones or more that are off."""
     joined = is_off[one] & is_off[other]
-    graph = coo_array(
-        (np.ones(joined.sum()), (one[joined], other[joined])), shape=(len(is_off), len(is_off))
-    )
-    labels = connected_components(graph, directed=False)[1]
+    one, other = one[joined], other[joined]
+    labels, before = np.arange(len(is_off)), None
+    while before is None or (labels != before).any():  # each photo takes the least of its group
+        before = labels.copy()
+        np.minimum.at(labels, one, before[other])
+        np.minimum.at(labels, other, labels[one])
     found: NDArray[np.bool_] = np.bincount(labels)[labels] >= MIN_BLOCK
     return found
 
