@@ -84,6 +84,14 @@ JsonOption = Annotated[
 MapOption = Annotated[
     str | None, typer.Option("--map", help="Name of the map. Default: `default`.")
 ]
+TimeZoneOption = Annotated[
+    str | None,
+    typer.Option(
+        "--time-zone",
+        metavar="ZONE",
+        help="Time zone of photos whose EXIF has none, such as +02:00 or Europe/Paris.",
+    ),
+]
 ServerOption = Annotated[
     str | None,
     typer.Option(

@@ -44,6 +44,7 @@ from services.cli.output import (
     KeyOption,
     MapOption,
     ServerOption,
+    TimeZoneOption,
     atomic_write,
     check_output_path,
     print_failures,
@@ -92,13 +93,7 @@ def index(
         str | None,
         typer.Option(help="UTM zone of @UTM@ file names that don't contain it, such as 32T."),
     ] = None,
-    time_zone: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ZONE",
-            help="Time zone of photos whose EXIF has none, such as +02:00 or Europe/Paris.",
-        ),
-    ] = None,
+    time_zone: TimeZoneOption = None,
     places: Annotated[
         bool,
         typer.Option(

@@ -36,6 +36,7 @@ from services.cli.output import (
     MapOption,
     ServerOption,
     Table,
+    TimeZoneOption,
     err_console,
     format_percent,
     print_json,
@@ -113,13 +114,7 @@ def locate(
             "neighbours in time, not only those of the same camera.",
         ),
     ] = False,
-    time_zone: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ZONE",
-            help="Time zone of photos whose EXIF has none, such as +02:00 or Europe/Paris.",
-        ),
-    ] = None,
+    time_zone: TimeZoneOption = None,
     clock_offset: Annotated[
         float,
         typer.Option(
