@@ -157,18 +157,6 @@ def test_older_catalog_stops_every_start_and_no_object_is_touched(filled: Filled
     assert {info.key for info in filled.store.list("")} == before
 
 
-def test_older_catalog_that_is_made_the_owner_deletes_no_original(filled: Filled) -> None:
-    originals = filled.originals()
-    filled.remove_catalog()
-    shutil.copy(filled.older_catalog, filled.home / "catalog.sqlite")
-    assert filled.command("storage", "adopt", "--confirm").returncode == 0
-    with filled.server(**SETTINGS) as running:
-        assert _searchable(running) == EARLY
-        _wait_for_collection(running)
-        assert _figures(running)["placewise_steward_collection_held"] == {(): 1}
-    assert filled.originals() == originals
-
-
 def test_a_removed_catalog_stops_every_start_until_the_store_is_adopted_which_deletes_nothing(
     filled: Filled,
 ) -> None:
