@@ -18,12 +18,8 @@ from shared.catalog.jobs import SINGLE_CLAIM_JOBS, Priority, WaitingFor, get_job
 from shared.errors import NotFound
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.claim import claim_jobs, fair_batch_size
-from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.model_changes import (
     wake_vocabulary_waiters,
-)
-from shared.jobs.transitions import (
-    requeue_job,
 )
 from tests.contract.jobs.jobs import ids, queue, token_of
 from tests.support.catalog_rows import (
@@ -149,19 +145,6 @@ def test_below_the_least_priority_nothing_is_claimed(catalog: Catalog, map_id: U
     query = queue(catalog, map_id, kind=JobKind.DESCRIBE)
     assert ids(take(catalog, least_priority=Priority.QUERY)) == query
     assert ids(take(catalog)) == bulk
-
-
-def test_every_claim_has_a_fresh_token(catalog: Catalog, map_id: UUID) -> None:
-    queue(catalog, map_id, 2)
-    tokens = set()
-    for _ in range(4):
-        jobs = take(catalog)
-        assert len(jobs) == 2
-        tokens.add(token_of(jobs))
-        with catalog.write() as session:
-            for job in lock_leased_jobs(session, token_of(jobs), jobs):
-                requeue_job(job)
-    assert len(tokens) == 4
 
 
 def test_workers_that_claim_at_once_never_get_the_same_job(catalog: Catalog, map_id: UUID) -> None:

@@ -273,16 +273,6 @@ def test_a_filter_is_applied_in_every_shard(places: SmallMap, tier_of: OpenTier)
     assert response.rows_scanned == len(reference)
 
 
-def test_equal_scores_of_all_shards_come_in_the_order_of_the_photos(
-    catalog: Catalog, store: FolderStore, tier_of: OpenTier
-) -> None:
-    places = SmallMap(catalog, store)
-    for slot in (2, 0, 1, 0):
-        places.add(np.repeat(VECTOR[np.newaxis], 3, axis=0), slot)
-    response = ask(tier_of(1, 1, 1), places, k=8)
-    assert [hit.photo_id for hit in response.hits] == sorted(places.rows)[:8]
-
-
 # --- status -----------------------------------------------------------------------------------
 
 

@@ -319,18 +319,6 @@ def test_a_photo_that_comes_while_search_loads_is_described_before_the_switch(
 # --- the entries -----------------------------------------------------------------------------
 
 
-def test_a_worker_reports_its_heartbeat_and_what_it_has_loaded(
-    fitted: Workplace, register: Register, catalog: Catalog
-) -> None:
-    worker = register("worker", "1/3")
-    (entry,) = entries(catalog)
-    assert (entry.name, entry.shard, entry.shards, entry.loaded) == ("worker", 1, 3, {})
-    worker.catch_up()
-    (entry,) = entries(catalog)
-    version = worker.worker.status().versions[fitted.active().id]
-    assert entry.loaded == {str(fitted.active().id): version}
-
-
 def test_a_running_worker_keeps_its_entry_fresh_and_removes_it_in_the_end(
     register: Register, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
