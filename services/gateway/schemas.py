@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from services.gateway.dependencies import API_PREFIX
 from shared.catalog.generations import GenerationState, RowType
+from shared.catalog.jobs import JOB_TYPES
 from shared.catalog.maps import DEFAULT_MAP
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.vocabularies import VocabularyOrigin
@@ -335,21 +336,6 @@ class JobProgress(ResponseModel):
     failed: int = Field(validation_alias="progress_failed")
 
 
-JOB_LABELS = {
-    JobKind.INDEX: "Photo",
-    JobKind.REINDEX: "Photo for a new model",
-    JobKind.DESCRIBE: "Query photo",
-    JobKind.FIT: "Improving the map",
-    JobKind.IMPORT: "Vocabulary import",
-    JobKind.SWITCH: "Switch",
-    JobKind.PCA: "PCA",
-    JobKind.ADD_MODEL: "New model",
-    JobKind.RECONSTRUCT: "Reconstruction",
-    JobKind.EVALUATE: "Evaluation",
-    JobKind.BATCH: "Batch",
-}
-
-
 class JobResponse(ResponseModel):
     job_id: UUID = Field(validation_alias="id")
     kind: JobKind
@@ -390,7 +376,7 @@ class JobResponse(ResponseModel):
         is_query = job.kind == JobKind.DESCRIBE
         return cls.of_row(
             job,
-            label=JOB_LABELS[JobKind(job.kind)],
+            label=JOB_TYPES[JobKind(job.kind)].title,
             progress=JobProgress.model_validate(job),
             map=map_name,
             filename=filename,
