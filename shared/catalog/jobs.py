@@ -44,21 +44,13 @@ from shared.catalog.database.base import (
     list_newest,
     partial_index,
 )
+from shared.enums import JobState as JobState
 from shared.ids import new_id
 from shared.telemetry.tracing import (
     MAX_REQUEST_ID_CHARACTERS,
     current_request_id,
     current_traceparent,
 )
-
-
-class JobState(StrEnum):
-    QUEUED = "queued"  # waits for a worker, or for what `waiting_for` names
-    RUNNING = "running"  # a worker has its lease, or it pauses between two slices
-    SUCCEEDED = "succeeded"  # completed: its effect is visible
-    FAILED = "failed"  # ended with `error`; may be retried
-    CANCELLED = "cancelled"  # ended on request; may be retried
-
 
 UNFINISHED_STATES = (JobState.QUEUED, JobState.RUNNING)
 
