@@ -69,7 +69,6 @@ class SearchRequest(_Message):
     min_version: int = Field(ge=0)
     k: int = Field(ge=1)
     photos: PhotoFilter = NO_FILTER
-    min_score: float | None = None
     exclude: tuple[UUID, ...] = ()
     mode: Mode = Mode.AUTO
     background: tuple[RowReference, ...] = ()

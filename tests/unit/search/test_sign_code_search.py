@@ -45,7 +45,7 @@ def by_codes(monkeypatch: pytest.MonkeyPatch) -> None:
 @given(case=cases(DIMENSION))
 def test_answers_equal_brute_force_with_order_and_ties(case: Case) -> None:
     snapshot = snapshot_of(case.rows, case.pieces)
-    found = answer(snapshot, case.query, case.selected, SearchOptions(case.k, case.min_score))
+    found = answer(snapshot, case.query, case.selected, SearchOptions(case.k))
     assert_best(hits_of(found), case.exact, case.k)
     if case.selected.any():
         assert found.certificate == "statistical"
