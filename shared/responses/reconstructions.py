@@ -36,7 +36,7 @@ class ComponentResponse(ResponseModel):
     )
     not_aligned: str | None = Field(description="why it is not aligned")
     calibration: dict[str, Any] | None = Field(
-        description="errors of the poses of its own photos, each found again without itself, in "
+        description="errors of the poses of its own photos, each localised without itself, in "
         "standard deviations (`position_68`, `position_95`, `heading_68`, `heading_95`), the share "
         "that was found (`share_found`), and the number of `poses` that this rests on"
     )
