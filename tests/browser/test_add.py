@@ -88,7 +88,9 @@ def test_many_photos_go_as_a_batch_with_counters_and_named_errors(
     assert found["total_found"] == 30
 
 
-def test_test_photos_are_measured_with_and_never_found(page: Page, city: CityServer) -> None:
+def test_test_photos_are_used_by_evaluations_and_are_no_search_results(
+    page: Page, city: CityServer
+) -> None:
     page.get_by_text("Details for these photos").click()
     page.get_by_label("Use").select_option("Test photos")
     add(page, photo(1))

@@ -237,7 +237,9 @@ def test_an_empty_map_finds_nothing_and_recommends_no_vocabulary(
     expect(page.locator(".verdict .hint")).to_have_count(0)
 
 
-def test_an_answer_without_a_place_is_no_guess(visitor: Visitor, city: CityServer) -> None:
+def test_an_answer_without_a_place_is_not_shown_as_a_guess(
+    visitor: Visitor, city: CityServer
+) -> None:
     found = city.ask(city.queries[0])
     found["estimate"] |= {
         **NO_LEVELS,
@@ -320,7 +322,9 @@ def test_a_pasted_photo_is_a_query(visitor: Visitor, city: CityServer) -> None:
     expect(page.locator(".query-photo figcaption")).to_have_text("pasted.jpg")
 
 
-def test_of_two_questions_the_later_one_is_answered(visitor: Visitor, city: CityServer) -> None:
+def test_the_page_shows_the_result_of_the_later_of_two_queries(
+    visitor: Visitor, city: CityServer
+) -> None:
     page = visitor.visit("ask")
     held: list[Route] = []
     page.route("**/api/v1/similarity?*", lambda route: held.append(route), times=1)

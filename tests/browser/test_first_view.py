@@ -12,7 +12,7 @@ from tests.browser.conftest import CityServer, Visitor
 MOST_BYTES = 300_000
 
 
-def test_the_first_view_is_small(context: BrowserContext, visitor: Visitor) -> None:
+def test_the_first_view_loads_few_bytes(context: BrowserContext, visitor: Visitor) -> None:
     received: list[float] = []
     network = context.new_cdp_session(visitor.page)
     network.send("Network.enable")

@@ -80,7 +80,7 @@ def kill() -> None:
     raise Killed
 
 
-def test_a_killed_evaluation_begins_anew(city: EvaluatedMap) -> None:
+def test_a_killed_evaluation_starts_from_the_beginning(city: EvaluatedMap) -> None:
     city.publish(STREETS)
     job_id = city.start()
     with pytest.raises(Killed):
