@@ -131,7 +131,9 @@ def models(settings: Settings, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -
     )
 
 
-def test_what_fits_is_remembered_when_the_model_is_loaded_anew(models: ModelRegistry) -> None:
+def test_the_fitting_batch_size_is_kept_when_the_model_is_loaded_again(
+    models: ModelRegistry,
+) -> None:
     models.extractor("test-tiny-avg").limit.record_out_of_memory(2, SIDE * SIDE)
     first_backbone = weakref.ref(models.extractor("test-tiny-avg").backbone)
     other = models.extractor("test-slow-avg")
