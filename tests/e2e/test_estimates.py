@@ -12,9 +12,8 @@ import pytest
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess
 
-AUTOMATIC = 64  # located photos from which a map is evaluated by itself
-SETTINGS = {"auto_evaluate_photos": AUTOMATIC}
-ENOUGH = 60  # to tell one in twenty, and not evaluated by itself
+SETTINGS = {"auto_evaluate_photos": 0}
+ENOUGH = 60  # to tell one in twenty
 MANY = 60  # more than an estimate looks at
 fresh = itertools.count(9000)
 
@@ -197,18 +196,3 @@ def test_more_photos_than_an_estimate_looks_at_are_answered(server: ServerProces
     none = ask(server, "many", photo_bytes(next(fresh)), min_score=1)
     assert none["similar_images"] == []
     assert "look like it have no coordinates" in none["estimate"]["reason"]
-
-
-def test_a_map_that_has_grown_is_evaluated_by_itself(server: ServerProcess) -> None:
-    numbers = [next(fresh) for _ in range(AUTOMATIC)]
-    fill(server, "grown", numbers, *({"latitude": 1, "longitude": n} for n in range(AUTOMATIC)))
-    deadline = time.monotonic() + 60
-    found: list[Any] = []
-    while not found:
-        assert time.monotonic() < deadline, "no evaluation came"
-        time.sleep(0.05)
-        found = got(server.client.get("/api/v1/evaluations", params={"map": "grown"}))[
-            "evaluations"
-        ]
-    assert found[0]["automatic"]
-    assert ask(server, "grown", re_encoded(numbers[1]))["estimate"]["levels"]
