@@ -232,7 +232,7 @@ class TrainingArguments(BaseModel):
     devices: Annotated[int | str | tuple[int, ...], BeforeValidator(_parse_literal)] = (0,)
     """Device to train on: its index as [0], or 1 for any."""
     precision: Annotated[int | str, BeforeValidator(_parse_literal)] = 32
-    """Floating-point precision: 32, 16-mixed or bf16-mixed."""
+    """Floating-point precision: 32 (on a GPU with TF32), 32-true, 16-mixed or bf16-mixed."""
     compile: bool = False
     """Compile the network with torch.compile. Sums may differ in last digits."""
 

@@ -27,7 +27,7 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.installation import open_installation_store
 from shared.catalog.processes import process_heartbeat
 from shared.config.settings import Settings
-from shared.jobs.celery_wakeups import CeleryWakeups, create_celery_app
+from shared.jobs.celery_messages import CeleryJobMessages, create_celery_app
 from shared.storage import ObjectStore
 from shared.telemetry.metrics_server import serve_metrics
 
@@ -58,7 +58,7 @@ def _run_extractor(
         signal.signal(number, lambda *_: stop.set())
     with (
         serve_metrics(settings, registry),
-        contextlib.closing(CeleryWakeups(app, settings, name)) as wakeups,
+        contextlib.closing(CeleryJobMessages(app, settings, name)) as wakeups,
         contextlib.closing(
             ExtractorWorker(catalog, store, settings, name, registry=registry, wakeups=wakeups)
         ) as worker,

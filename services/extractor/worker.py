@@ -37,13 +37,7 @@ from services.extractor.handlers import HANDLERS, ExtractorContext, JobBatch
 from services.extractor.metrics import ExtractorMetrics
 from services.extractor.model_registry import ModelRegistry
 from shared.catalog.database.session import Catalog
-from shared.catalog.jobs import (
-    CHILD_PROCESS_JOBS,
-    EXTRACTOR_JOBS,
-    MODEL_CHANGE_JOBS,
-    JobKind,
-    WaitingFor,
-)
+from shared.catalog.jobs import DRAINED_JOBS, SINGLE_CLAIM_JOBS, WaitingFor
 from shared.catalog.processes import PROCESS_HEARTBEAT_SECONDS, list_processes
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
@@ -100,8 +94,7 @@ class ExtractorWorker:
         )
         on_outcome = self._metrics.count_step_outcome
         self.fits = FitWorker(self.context, name, on_outcome, compute_fit, wakeups)
-        drained = [kind for kind in EXTRACTOR_JOBS if kind not in CHILD_PROCESS_JOBS]
-        self._runner = JobRunner(catalog, settings, name, drained, on_outcome, wakeups)
+        self._runner = JobRunner(catalog, settings, name, DRAINED_JOBS, on_outcome, wakeups)
         # Two threads, so that a query's photo does not wait for the photos of the next batch.
         self._prepare_executor = ThreadPoolExecutor(max_workers=2, thread_name_prefix="prepare")
         self._query_executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="queries")
@@ -297,4 +290,4 @@ def _is_query(batch: JobBatch) -> bool:
 
 def _runs_exclusively(batch: JobBatch) -> bool:
     """Whether nothing may run concurrently, so that a crash can be attributed to the job."""
-    return batch.jobs[0].alone or batch.kind in (JobKind.ADD_MODEL, *MODEL_CHANGE_JOBS)
+    return batch.jobs[0].alone or batch.kind in SINGLE_CLAIM_JOBS

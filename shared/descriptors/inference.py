@@ -4,8 +4,8 @@ Batch size: a forward pass that runs out of GPU memory is retried with half of i
 passes do not exceed that size. Memory grows with pixels, so the limit counts pixels, not photos.
 
 Precision: `float32`, or `bfloat16` where that loses little accuracy. bfloat16 uses autocast:
-weights, residual sums, normalisations and everything after the backbone stay float32; matrix
-products and convolutions run in bfloat16. It has float32's range, so that what fits into one fits
+residual sums, normalisations and everything after the backbone stay float32; matrix products and
+convolutions run in bfloat16. It has float32's range, so that what fits into one fits
 into the other, and 8 bits of precision. In float32, TF32 (11 bits of precision), which PyTorch
 allows for convolutions by default, is disabled.
 """
@@ -24,7 +24,7 @@ from typing import Literal, get_args
 import numpy as np
 import torch
 
-from shared.errors import Unprocessable
+from shared.errors import Misconfigured, Unprocessable
 from shared.extractor_config.configs import ExtractorConfig
 from shared.imaging.preprocessing import Pixels
 
@@ -65,6 +65,19 @@ class PhotoTooLargeForGpu(Unprocessable):
         )
         error.place = place
         return error
+
+
+@contextlib.contextmanager
+def model_fits_gpu(name: str) -> Iterator[None]:
+    """Raise Misconfigured (`gpu_out_of_memory`) if the block finds no memory for a model."""
+    try:
+        yield
+    except (torch.cuda.OutOfMemoryError, PhotoTooLargeForGpu) as error:
+        raise Misconfigured(
+            "gpu_out_of_memory",
+            f"The GPU's memory does not hold the weights of {name} and a single photo. Check what "
+            "else uses the GPU (`nvidia-smi`), or configure a smaller extractor or DEVICE=cpu.",
+        ) from error
 
 
 class BatchSizeLimit:

@@ -50,7 +50,7 @@ from services.cli.output import (
     printable_text,
     progress_bar,
 )
-from shared.catalog.photo_role import PhotoRole
+from shared.enums import PhotoRole
 from shared.errors import InvalidRequest
 from shared.imaging.file_formats import PHOTO_SUFFIXES
 

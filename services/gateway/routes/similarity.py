@@ -21,7 +21,7 @@ from services.gateway.dependencies import (
     wait_for_job,
 )
 from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
-from services.gateway.schemas import JobAcceptedResponse, SimilarityResponse
+from services.gateway.responses import JobAcceptedResponse
 from services.gateway.similarity.execute import find_similar, query_from_job, query_from_photo
 from services.gateway.similarity.geopose import GEOPOSE, GeoPoseDep, with_geopose
 from services.gateway.similarity.matches import check_matching_enabled
@@ -39,6 +39,7 @@ from shared.errors import Conflict, Gone, NotFound, Unprocessable, invalid_field
 from shared.imaging.photo_header import read_photo_header
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.wakeups import JobMessage
+from shared.responses.similarity import SimilarityResponse
 from shared.storage.keys import query_preview_key
 
 router = APIRouter(tags=["similarity"])

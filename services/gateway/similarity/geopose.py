@@ -11,9 +11,9 @@ from typing import Annotated, Any
 from fastapi import Depends, Request
 from fastapi.responses import JSONResponse
 
-from services.gateway.schemas import CameraPoseResponse, SimilarityResponse
 from services.gateway.similarity.search_params import SearchParams
 from shared.errors import Unprocessable
+from shared.responses.similarity import CameraPoseResponse, SimilarityResponse
 
 MEDIA_TYPE = "application/geopose+json"
 JSON_TYPE = "application/json"

@@ -36,7 +36,7 @@ from tests.support.catalog_rows import failure_code, problem_of, set_columns
 from tests.support.photos import encoded, photo_bytes, photo_image
 
 
-def test_each_photo_gets_its_one_row_and_the_right_one(averages: Workplace) -> None:
+def test_each_photo_has_one_descriptor_row_that_is_its_own(averages: Workplace) -> None:
     photo_ids = averages.upload(*range(9))  # three batches
     averages.drain()
     assert averages.ended() == (9, 0)
@@ -82,7 +82,7 @@ def test_a_query_in_an_empty_map_leaves_its_row_beside_its_bytes_and_none_in_the
     assert averages.rows() == {}
 
 
-def test_a_photo_that_is_at_fault_fails_alone(averages: Workplace) -> None:
+def test_an_undecodable_photo_fails_without_the_others_of_its_batch(averages: Workplace) -> None:
     good = averages.upload(1, 2)
     _, undecodable = averages.upload_bytes(b"\xff\xd8\xff\xe0 this is no JPEG")
     lost_photo, lost = averages.upload_bytes(photo_bytes(4))
@@ -121,7 +121,7 @@ def test_two_workers_at_once_describe_each_photo_once(
 
 
 @pytest.mark.databases("sqlite", "postgresql")
-def test_of_two_workers_that_begin_a_maps_first_generation_one_wins(
+def test_two_workers_create_one_first_generation_of_a_map(
     averages: Workplace,
     make_worker: Callable[[], ExtractorWorker],
     monkeypatch: pytest.MonkeyPatch,
@@ -200,7 +200,7 @@ def test_a_query_does_not_wait_for_the_batch_that_is_being_described(
     assert len(averages.rows()) == 5
 
 
-def test_nothing_is_described_beside_a_photo_that_is_tried_alone(
+def test_no_query_is_described_beside_a_job_marked_alone(
     averages: Workplace, before_describing: Hook
 ) -> None:
     photo_id, job_id = averages.upload_bytes(photo_bytes(0))

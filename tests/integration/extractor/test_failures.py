@@ -180,7 +180,7 @@ def test_nothing_of_a_batch_is_committed_once_its_lease_was_taken_over(
     assert {averages.job_of(photo_id).worker for photo_id in photo_ids} == {"worker-1"}
 
 
-def test_one_job_that_was_taken_over_is_a_dead_row_beside_the_others(
+def test_a_job_that_was_taken_over_leaves_a_dead_row_in_the_chunk(
     averages: Workplace, before_describing: Hook
 ) -> None:
     photo_ids = averages.upload(1, 2, 3)
@@ -223,7 +223,7 @@ def test_a_photo_deleted_while_it_is_described_is_not_in_the_generation(
     assert states(averages.catalog, [goes, left]) == [JobState.CANCELLED, JobState.CANCELLED]
 
 
-def test_a_photo_deleted_before_it_is_read_costs_nothing(averages: Workplace) -> None:
+def test_a_photo_deleted_before_it_is_read_is_not_described(averages: Workplace) -> None:
     photo_ids = averages.upload(1, 2)
     job_id = averages.job_of(photo_ids[0]).id
     averages.delete(photo_ids[0])

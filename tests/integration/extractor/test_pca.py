@@ -172,7 +172,7 @@ def test_queries_and_new_photos_are_projected(reduced: Workplace) -> None:
 
 
 @pytest.mark.parametrize("missing", [False, True])
-def test_a_photo_whose_row_is_damaged_is_described_anew(
+def test_a_photo_with_a_damaged_row_is_described_from_its_original(
     described: Workplace, monkeypatch: pytest.MonkeyPatch, missing: bool
 ) -> None:
     before = described.rows()
@@ -237,7 +237,7 @@ def test_photos_are_described_where_the_rows_that_answer_were_made_otherwise(
 # --- going on from there ---------------------------------------------------------------------
 
 
-def test_the_way_back_leads_to_whole_descriptors(described: Workplace) -> None:
+def test_switching_off_pca_describes_full_dimension_again(described: Workplace) -> None:
     before, old = described.rows(), described.active()
     reduce(described)
     job = described.finish(described.start(JobKind.SWITCH, vocabulary_id=None))
@@ -270,7 +270,7 @@ def test_a_pca_of_a_pca_is_refused(reduced: Workplace) -> None:
     assert reduced.active().id == before
 
 
-def test_what_can_not_be_fitted_fails_with_the_reason(described: Workplace) -> None:
+def test_a_pca_fit_on_too_few_photos_or_to_too_many_dimensions_fails(described: Workplace) -> None:
     before = described.active().id
     for pca, code in ((PHOTOS, "pca_too_few_rows"), (17, "pca_too_many_dimensions")):
         assert failure_code(described.finish(described.start(JobKind.PCA, pca=pca))) == code
@@ -313,7 +313,7 @@ def test_a_cancelled_pca_changes_nothing(described: Workplace) -> None:
 # --- what is left of it ----------------------------------------------------------------------
 
 
-def test_a_whitening_goes_when_its_generations_have_ended(reduced: Workplace) -> None:
+def test_a_whitening_is_deleted_after_its_last_generation(reduced: Workplace) -> None:
     (stored,) = whitenings(reduced)
     collect_whitenings(reduced.catalog, reduced.store, grace_seconds=0)
     collect_orphans(reduced.catalog, reduced.store, age_seconds=-1)

@@ -126,7 +126,7 @@ def test_query_is_published_at_once_while_bulk_batches_wait_to_be(
     assert len(averages.rows()) == 2 * BATCH + 1
 
 
-def test_photo_that_is_tried_alone_begins_when_nothing_else_is_under_way(
+def test_job_marked_alone_starts_after_all_others_have_ended(
     averages: Workplace, gate: Gate
 ) -> None:
     averages.upload(*range(BATCH))
@@ -161,7 +161,7 @@ def test_stopping_worker_publishes_what_it_has_described_and_gives_back_the_rest
     assert all(job.attempts == 0 and not job.alone for job in left)
 
 
-def test_batch_whose_publishing_crashes_is_tried_alone_and_the_next_one_is_not_to_blame(
+def test_jobs_of_a_batch_whose_publishing_crashed_are_retried_alone_and_the_next_batch_is_not(
     averages: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls = iter(range(100))

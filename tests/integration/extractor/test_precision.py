@@ -33,7 +33,7 @@ def precision_of(generation: Generation) -> str:
     return found
 
 
-def test_another_setting_describes_nothing_anew_and_photos_join_in_the_generations_precision(
+def test_changing_the_precision_setting_keeps_the_precision_of_existing_generations(
     averages: Workplace, make_worker: Callable[..., ExtractorWorker]
 ) -> None:
     assert not same(row("float32", 2), row("bfloat16", 2)), "else this test could not fail"
@@ -51,7 +51,7 @@ def test_another_setting_describes_nothing_anew_and_photos_join_in_the_generatio
     assert same(rows[second[0]], row("float32", 2))
 
 
-def test_setting_decides_for_a_map_that_begins(
+def test_the_precision_setting_applies_to_new_maps(
     averages: Workplace, make_worker: Callable[..., ExtractorWorker]
 ) -> None:
     averages._worker = make_worker(precision="bfloat16")
@@ -61,7 +61,7 @@ def test_setting_decides_for_a_map_that_begins(
     assert same(averages.rows()[photo_id], row("bfloat16", 2))
 
 
-def test_model_change_brings_the_other_precision_to_all_photos(
+def test_a_model_change_applies_the_precision_setting(
     averages: Workplace, make_worker: Callable[..., ExtractorWorker]
 ) -> None:
     photo_ids = averages.upload(1, 2, 3)
@@ -89,7 +89,7 @@ def test_pca_keeps_the_precision_of_the_rows_that_it_shortens(
     assert shortened.keys() - whole.keys() == {"whitening"}
 
 
-def test_photos_wait_where_the_generations_precision_is_not_known(averages: Workplace) -> None:
+def test_photos_wait_for_a_worker_that_knows_the_generations_precision(averages: Workplace) -> None:
     averages.upload(1)
     averages.drain()
     _set_precision(averages, averages.active().id, "float8")

@@ -55,7 +55,7 @@ def test_a_fit_can_be_cancelled_in_each_stage(
     assert fitted.active().id != old
 
 
-def test_a_worker_that_stops_gives_its_fit_back(
+def test_a_stopping_worker_requeues_its_fit(
     fitted: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job_id = fitted.start(JobKind.FIT, **{**FIT, "seed": 1})
@@ -188,7 +188,7 @@ def test_switching_back_gives_the_descriptors_of_the_earlier_vocabulary(fitted: 
     assert all(same(before[photo_id], row) for photo_id, row in rows.items())
 
 
-def test_a_switch_that_can_not_be_fails_with_the_reason(
+def test_an_impossible_switch_fails_with_the_reason(
     fitted: Workplace, workplace_of: Callable[[str], Workplace]
 ) -> None:
     old = fitted.active()
@@ -205,7 +205,7 @@ def test_a_switch_that_can_not_be_fails_with_the_reason(
     assert fitted.active().id == old.id
 
 
-def test_progress_is_never_negative_and_never_falls(averages: Workplace) -> None:
+def test_progress_of_a_model_change_is_monotonic(averages: Workplace) -> None:
     averages.upload(1)
     averages.drain()
     (photo_id,) = photo_ids(averages)

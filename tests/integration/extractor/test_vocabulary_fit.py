@@ -270,7 +270,7 @@ def test_each_run_queues_another_chunk_however_little_time_it_has(
     assert fitted.finish(job_id).state == JobState.SUCCEEDED
 
 
-def test_deleted_photos_are_not_waited_for(fitted: Workplace) -> None:
+def test_a_model_change_does_not_wait_for_deleted_photos(fitted: Workplace) -> None:
     job_id, new = fitted.build(seed=1)
     before, after, *rest = photo_ids(fitted)
     fitted.delete(before)  # before it was queued for the new generation
@@ -349,7 +349,7 @@ def test_a_photo_that_failed_in_a_generation_is_described_when_it_is_queued_agai
     assert bad in fitted.rows()
 
 
-def test_a_reindex_job_that_someone_cancelled_is_made_anew(fitted: Workplace) -> None:
+def test_a_cancelled_reindex_job_is_queued_again(fitted: Workplace) -> None:
     job_id, new = fitted.build(seed=1)
     fitted.advance()
     first = fitted.reindex_jobs(new)[0]
@@ -391,7 +391,7 @@ def test_a_change_that_loses_more_than_one_per_cent_of_the_searchable_photos_fai
     assert fitted.fit(seed=1).state == JobState.SUCCEEDED
 
 
-def test_photos_that_were_not_searchable_are_no_loss_and_are_tried_again_by_the_next_change(
+def test_photos_that_failed_before_do_not_count_as_lost_and_are_described_again(
     vlads: Workplace,
 ) -> None:
     photos = vlads.upload(*range(3))
@@ -419,14 +419,14 @@ def failed_photos(workplace: Workplace) -> set[UUID]:
         return set(session.scalars(select_failed_photos(workplace.map_id)))
 
 
-def test_a_steward_that_forgot_what_it_queued_queues_nothing_twice(fitted: Workplace) -> None:
+def test_a_restarted_steward_queues_no_reindex_job_twice(fitted: Workplace) -> None:
     _, new = fitted.build(seed=1)
     fitted.advance()
     advance_model_changes(fitted.catalog, fitted.wakeups)
     assert len(fitted.reindex_jobs(new)) == PHOTOS
 
 
-def test_what_a_switch_leaves_is_completed_in_small_transactions(
+def test_jobs_left_by_a_killed_switch_are_settled_in_small_transactions(
     fitted: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reindex_jobs, "REINDEX_JOBS_PER_TRANSACTION", 2)

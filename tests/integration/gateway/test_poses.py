@@ -16,7 +16,6 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 from scipy.spatial.transform import Rotation
 
-from services.gateway.schemas import CameraPoseResponse
 from services.gateway.similarity.geopose import MEDIA_TYPE, geopose
 from shared.catalog.chunks import Chunk
 from shared.catalog.generations import Generation
@@ -39,6 +38,7 @@ from shared.geometry.frames import (
     rotation_of_vector,
 )
 from shared.matching.features import LocalFeatures
+from shared.responses.similarity import CameraPoseResponse
 from shared.storage.keys import query_features_key
 from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import add_reconstruction

@@ -25,11 +25,11 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.installation import open_installation_store
 from shared.config.settings import Settings
 from shared.ids import new_id
-from shared.jobs import Job, JobKind, JobState, celery_wakeups
-from shared.jobs.celery_wakeups import (
+from shared.jobs import Job, JobKind, JobState, celery_messages
+from shared.jobs.celery_messages import (
     BROKER_TIMEOUT_SECONDS,
     MAX_QUEUED,
-    CeleryWakeups,
+    CeleryJobMessages,
     create_celery_app,
     encode_message,
 )
@@ -59,8 +59,8 @@ def app(own_redis: RedisServer) -> Celery:
 
 
 @pytest.fixture
-def wakeups(app: Celery, own_redis: RedisServer) -> Iterator[CeleryWakeups]:
-    made = CeleryWakeups(app, Settings(redis_url=own_redis.url))
+def wakeups(app: Celery, own_redis: RedisServer) -> Iterator[CeleryJobMessages]:
+    made = CeleryJobMessages(app, Settings(redis_url=own_redis.url))
     yield made
     made.close()
 
@@ -83,7 +83,7 @@ def until(condition) -> None:  # type: ignore[no-untyped-def]
 
 
 def test_celery_reads_a_message_that_names_the_job_its_map_and_its_file(
-    wakeups: CeleryWakeups, app: Celery
+    wakeups: CeleryJobMessages, app: Celery
 ) -> None:
     job = message(7, JobKind.REINDEX)
     wakeups.send(job)
@@ -103,7 +103,7 @@ def test_flower_is_configured_with_the_queues_of_messages() -> None:
 
 
 def test_the_messages_of_claimed_jobs_are_withdrawn_and_those_of_others_stay(
-    wakeups: CeleryWakeups, app: Celery, client: Redis
+    wakeups: CeleryJobMessages, app: Celery, client: Redis
 ) -> None:
     jobs = [message(number) for number in range(5)]
     wakeups.send(*jobs)
@@ -115,7 +115,7 @@ def test_the_messages_of_claimed_jobs_are_withdrawn_and_those_of_others_stay(
 
 
 def test_a_queue_holds_few_messages_however_many_are_sent(
-    wakeups: CeleryWakeups, client: Redis
+    wakeups: CeleryJobMessages, client: Redis
 ) -> None:
     for _ in range(3):
         wakeups.send(*(message(number) for number in range(MAX_QUEUED // 2)))
@@ -128,7 +128,7 @@ def test_a_queue_holds_few_messages_however_many_are_sent(
 
 
 def test_without_redis_a_message_neither_waits_nor_raises_and_the_next_one_arrives(
-    wakeups: CeleryWakeups, client: Redis, own_redis: RedisServer
+    wakeups: CeleryJobMessages, client: Redis, own_redis: RedisServer
 ) -> None:
     assert own_redis.process is not None
     own_redis.process.kill()
@@ -144,7 +144,7 @@ def test_without_redis_a_message_neither_waits_nor_raises_and_the_next_one_arriv
 
 
 def test_a_full_redis_takes_events_and_no_messages(
-    wakeups: CeleryWakeups, app: Celery, client: Redis
+    wakeups: CeleryJobMessages, app: Celery, client: Redis
 ) -> None:
     client.config_set("maxmemory-policy", "noeviction")
     client.config_set("maxmemory", "1")
@@ -158,9 +158,9 @@ def test_a_full_redis_takes_events_and_no_messages(
 
 
 def test_closing_in_the_middle_of_a_burst_takes_no_time(
-    wakeups: CeleryWakeups, monkeypatch: pytest.MonkeyPatch
+    wakeups: CeleryJobMessages, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(celery_wakeups, "DEBOUNCE_SECONDS", 0.5)
+    monkeypatch.setattr(celery_messages, "DEBOUNCE_SECONDS", 0.5)
     wakeups.send(message())
     time.sleep(0.2)
     begun = time.monotonic()
@@ -222,7 +222,7 @@ def done(catalog: Catalog) -> dict[str, int]:
 
 
 def test_a_thread_that_redis_does_not_answer_is_stuck_unless_redis_answers_nobody(
-    wakeups: CeleryWakeups,
+    wakeups: CeleryJobMessages,
     app: Celery,
     own_redis: RedisServer,
     monkeypatch: pytest.MonkeyPatch,
@@ -272,7 +272,7 @@ def test_an_extractor_runs_queued_jobs_whatever_happens_to_the_messages(
     tmp_path: Path,
     catalog_on_postgres: Catalog,
     map_id: UUID,
-    wakeups: CeleryWakeups,
+    wakeups: CeleryJobMessages,
     client: Redis,
     extractor: Extractor,
 ) -> None:
@@ -314,7 +314,7 @@ def test_the_steward_sends_lost_messages_and_withdraws_those_of_jobs_that_wait_n
     tmp_path: Path,
     catalog_on_postgres: Catalog,
     map_id: UUID,
-    wakeups: CeleryWakeups,
+    wakeups: CeleryJobMessages,
     client: Redis,
 ) -> None:
     store = FolderStore(tmp_path / "objects", exclusive=False)

@@ -180,7 +180,7 @@ def test_a_generation_is_switched_in_once_the_slow_worker_has_loaded_it_too(
         assert len(found(worker, fitted, fitted.active())) == PHOTOS - 1
 
 
-def test_a_worker_that_dies_is_not_waited_for_for_ever(
+def test_a_switch_does_not_wait_for_a_dead_search_worker(
     fitted: Workplace, register: Register, catalog: Catalog
 ) -> None:
     living, dying = register("living"), register("dying")
@@ -197,7 +197,7 @@ def test_a_worker_that_dies_is_not_waited_for_for_ever(
     assert dying.worker.status().versions == {}
 
 
-def test_a_worker_that_lives_and_does_not_load_is_named_and_waited_for(
+def test_a_switch_waits_for_a_live_search_worker_that_has_not_loaded_and_names_it(
     fitted: Workplace, register: Register, catalog: Catalog, caplog: pytest.LogCaptureFixture
 ) -> None:
     register("stuck-b")
@@ -286,7 +286,7 @@ def test_a_model_change_whose_chunks_are_damaged_again_and_again_fails(
     assert fitted.active().id == old.id
 
 
-def test_a_shard_without_a_row_of_it_is_not_waited_for(
+def test_a_switch_does_not_wait_for_a_shard_without_rows(
     fitted: Workplace, register: Register
 ) -> None:
     first = register("first", "0/2")  # every photo is in slot 0
@@ -353,7 +353,9 @@ def _wait_until(true: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
-def test_the_steward_forgets_workers_that_are_dead(register: Register, catalog: Catalog) -> None:
+def test_the_steward_removes_the_entries_of_dead_workers(
+    register: Register, catalog: Catalog
+) -> None:
     register("living")
     register("dead")
     age(catalog, "living", SEARCH_WORKER_TIMEOUT_SECONDS - 5)
