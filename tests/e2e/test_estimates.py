@@ -11,6 +11,7 @@ import pytest
 
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess
+from tests.support.waiting import wait_until
 
 AUTOMATIC = 64  # located photos from which a map is evaluated by itself
 SETTINGS = {"auto_evaluate_photos": AUTOMATIC}
@@ -53,13 +54,9 @@ def ask(server: ServerProcess, name: str, data: bytes, **params: Any) -> dict[st
 
 def evaluate(server: ServerProcess, name: str) -> dict[str, Any]:
     started = got(server.client.post("/api/v1/evaluations", params={"map": name}), 202)
-    while True:
-        job: dict[str, Any] = got(
-            server.client.get(f"/api/v1/jobs/{started['job_id']}", params={"map": name, "wait": 30})
-        )
-        if job["state"] not in ("queued", "running"):
-            assert job["state"] == "succeeded", job
-            return job
+    job = server.finished(started["job_id"], map=name)
+    assert job["state"] == "succeeded", job
+    return job
 
 
 @pytest.fixture(scope="module")
@@ -202,13 +199,11 @@ def test_more_photos_than_an_estimate_looks_at_are_answered(server: ServerProces
 def test_a_map_that_has_grown_is_evaluated_by_itself(server: ServerProcess) -> None:
     numbers = [next(fresh) for _ in range(AUTOMATIC)]
     fill(server, "grown", numbers, *({"latitude": 1, "longitude": n} for n in range(AUTOMATIC)))
-    deadline = time.monotonic() + 60
-    found: list[Any] = []
-    while not found:
-        assert time.monotonic() < deadline, "no evaluation came"
-        time.sleep(0.05)
-        found = got(server.client.get("/api/v1/evaluations", params={"map": "grown"}))[
-            "evaluations"
-        ]
+
+    def evaluations() -> list[Any]:
+        answer = server.client.get("/api/v1/evaluations", params={"map": "grown"})
+        return list(got(answer)["evaluations"])
+
+    found = wait_until(evaluations)
     assert found[0]["automatic"]
     assert ask(server, "grown", re_encoded(numbers[1]))["estimate"]["levels"]
