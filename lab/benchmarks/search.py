@@ -393,9 +393,9 @@ def measure_cold_cache(
     assert len(mappings) == len(snapshot.chunks), "a loaded chunk is on disk"
     warm, cold, cached, differ = [], [], [], 0
     for number, row in enumerate(query_rows):
-        ours(row, COLD_K, None)
+        ours(row, COLD_K)
         started_at = time.perf_counter()
-        ours(row, COLD_K, None)
+        ours(row, COLD_K)
         warm.append(time.perf_counter() - started_at)
         for memory in mappings:
             memory.madvise(mmap.MADV_DONTNEED)
@@ -404,7 +404,7 @@ def measure_cold_cache(
                 os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
         cached.append(float(np.mean(np.concatenate(list(map(_cached_pages, mappings))))))
         started_at = time.perf_counter()
-        found = ours(row, COLD_K, None)
+        found = ours(row, COLD_K)
         cold.append(time.perf_counter() - started_at)
         differ += not same_ranking(found, oracle.best(number, COLD_K))
         bar.advance(task)
