@@ -50,6 +50,7 @@ class ResponseModel(BaseModel):
 
         The row's attributes are named as the fields, or as their `validation_alias`.
         """
+        assert values.keys() <= cls.model_fields.keys(), "they would be sent"
         for name, field in cls.model_fields.items():
             if name not in values and field.is_required():
                 values[name] = getattr(row, str(field.validation_alias or name))

@@ -52,13 +52,9 @@ def ask(server: ServerProcess, name: str, data: bytes, **params: Any) -> dict[st
 
 def evaluate(server: ServerProcess, name: str) -> dict[str, Any]:
     started = got(server.client.post("/api/v1/evaluations", params={"map": name}), 202)
-    while True:
-        job: dict[str, Any] = got(
-            server.client.get(f"/api/v1/jobs/{started['job_id']}", params={"map": name, "wait": 30})
-        )
-        if job["state"] not in ("queued", "running"):
-            assert job["state"] == "succeeded", job
-            return job
+    job = server.finished(started["job_id"], map=name)
+    assert job["state"] == "succeeded", job
+    return job
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,7 @@ import re
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import psutil
@@ -17,17 +16,9 @@ import pytest
 from tests.support.processes import PLACEWISE, REPOSITORY, start
 from tests.support.server import environment, run_command
 from tests.support.servers.daemon import has_ended
+from tests.support.waiting import wait_until
 
 pytestmark = pytest.mark.servers
-
-SECONDS = 60.0
-
-
-def wait_until(true: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + SECONDS
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 @pytest.mark.parametrize(

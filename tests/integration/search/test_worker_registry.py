@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import BinaryIO
@@ -34,6 +33,7 @@ from shared.storage.keys import QUERIES
 from tests.integration.workplace import Workplace
 from tests.support.catalog_rows import failure_code
 from tests.support.photos import photo_bytes
+from tests.support.waiting import wait_until
 
 PHOTOS = 5
 WAIT_SECONDS = 30.0
@@ -330,10 +330,10 @@ def test_a_running_worker_keeps_its_entry_fresh_and_removes_it_in_the_end(
     age(catalog, "worker", 100)
     running.start()
     try:
-        _wait_until(lambda: _seconds_ago(catalog) < 50)
+        wait_until(lambda: _seconds_ago(catalog) < 50)
         with catalog.write() as session:  # by a steward that could not hear of it
             session.delete(session.get_one(RegisteredSearchWorker, worker.presence.id))
-        _wait_until(lambda: bool(entries(catalog)))
+        wait_until(lambda: bool(entries(catalog)))
     finally:
         stop.set()
         running.join()
@@ -344,13 +344,6 @@ def _seconds_ago(catalog: Catalog) -> float:
     with catalog.read() as session:
         seen, now = session.execute(select(RegisteredSearchWorker.seen_at, db_now())).one()
         return float((now - seen).total_seconds())
-
-
-def _wait_until(true: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + WAIT_SECONDS
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 def test_the_steward_removes_the_entries_of_dead_workers(
