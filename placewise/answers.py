@@ -552,6 +552,7 @@ class Map(Answer):
     rows: str = "float32"
     auto_fit: bool = True
     matching: str = "auto"
+    elsewhere: float | None = None
     local_features: MapFeatures | None = None
     model_change_id: UUID | None = None
     next_fit_photos: int | None = None
