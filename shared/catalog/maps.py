@@ -90,6 +90,8 @@ class Map(Journaled, Base):
     matching: Mapped[Matching] = mapped_column(
         sa.String(20), default=Matching.AUTO, server_default=Matching.AUTO
     )
+    elsewhere: Mapped[float | None] = mapped_column(sa.Float)
+    """Share of its queries that are from elsewhere; null: ELSEWHERE_SHARE."""
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
@@ -103,6 +105,7 @@ def create_map(
     row_type: RowType = RowType.FLOAT32,
     auto_fit: bool = True,
     matching: Matching = Matching.AUTO,
+    elsewhere: float | None = None,
 ) -> Map:
     """Create an empty map; Conflict (`map_exists`) when the name is taken.
 
@@ -117,6 +120,7 @@ def create_map(
         row_type=row_type,
         auto_fit=auto_fit,
         matching=matching,
+        elsewhere=elsewhere,
     )
     try:
         with session.begin_nested():

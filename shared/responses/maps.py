@@ -15,6 +15,7 @@ AUTO_FIT = (
     "whether a vocabulary is fitted automatically: at 50 photos, and whenever the map has doubled "
     "since the last fit. Importing or choosing a vocabulary sets it to false"
 )
+ELSEWHERE = "share of its queries that are from elsewhere, where a request does not say it"
 MATCHING = (
     "whether local features of its photos are computed and matched: `on`, `off`, or `auto`: until "
     "an evaluation finds that matches do not improve the answers"
@@ -73,6 +74,7 @@ class MapResponse(ResponseModel):
     )
     auto_fit: bool = Field(description=AUTO_FIT)
     matching: Annotated[Matching, OPEN] = Field(description=MATCHING)
+    elsewhere: float = Field(description=ELSEWHERE)
     local_features: LocalFeaturesResponse | None = Field(
         description="local features of the active generation; null before the first photo"
     )

@@ -118,6 +118,20 @@ def test_labels_can_be_set_to_names_and_back_to_automatic(
         assert described["place_labels_are_paths"] is False
 
 
+def test_the_share_of_queries_from_elsewhere_is_set_in_percent(
+    visitor: Visitor, city: CityServer
+) -> None:
+    page = visitor.visit("model")
+    share = page.get_by_label("Queries from elsewhere")
+    expect(share).to_have_value("33")
+    for percent in (5, 33):
+        share.fill(str(percent))
+        share.press("Enter")
+        expect(page.locator(".note").first).to_contain_text("Saved.")
+        page.locator(".note button").first.click()
+        assert city.get(f"/maps/{MAP}")["elsewhere"] == percent / 100
+
+
 def test_status_shows_the_parts_the_map_and_the_newest_jobs(
     visitor: Visitor, city: CityServer
 ) -> None:

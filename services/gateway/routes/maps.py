@@ -36,13 +36,14 @@ from shared.config.settings import Settings
 from shared.errors import Misconfigured, invalid_field_error
 from shared.evaluation.places.fit import MIN_OWN_PHOTOS
 from shared.evaluation.places.levels import LevelScheme
-from shared.evaluation.places.probability import PlaceModel
+from shared.evaluation.places.probability import ELSEWHERE_SHARE, PlaceModel
 from shared.http.request_model import RequestModel
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.model_changes import get_unfinished_model_change, start_reindex
 from shared.jobs.transitions import cancel_jobs
 from shared.responses.maps import (
     AUTO_FIT,
+    ELSEWHERE,
     MATCHING,
     DeletedMapResponse,
     LocalFeaturesResponse,
@@ -84,6 +85,9 @@ class CreateMapRequest(RequestModel):
     )
     auto_fit: bool = Field(True, description=AUTO_FIT)
     matching: Matching = Field(Matching.AUTO, description=MATCHING)
+    elsewhere: float | None = Field(
+        None, gt=0, lt=1, description=f"{ELSEWHERE}; omitted: {ELSEWHERE_SHARE}"
+    )
 
     @field_validator("name")
     @classmethod
@@ -111,6 +115,9 @@ class UpdateMapRequest(RequestModel):
         None,
         description=f"{MATCHING}. `on` starts a model change if photos have no local features yet; "
         "omitted: unchanged",
+    )
+    elsewhere: float | None = Field(
+        None, gt=0, lt=1, description=f"{ELSEWHERE}; omitted: unchanged"
     )
 
 
@@ -146,6 +153,7 @@ def create_new_map(
             row_type=body.rows or RowType(settings.descriptor_rows),
             auto_fit=body.auto_fit,
             matching=body.matching,
+            elsewhere=body.elsewhere,
         )
         response = _map_response(session, settings, map_)
         idempotent.store_response(session, 201, response)
@@ -161,7 +169,8 @@ def read_map(gateway: GatewayDep, name: MapNamePath) -> MapResponse:
 
 @router.patch("/maps/{name}", operation_id="update_map", dependencies=[WRITE, CHECK_MAP])
 def update_map(gateway: GatewayDep, name: MapNamePath, body: UpdateMapRequest) -> MapResponse:
-    """Change settings of the map: labels that are paths, stored descriptors, fits, matching.
+    """Change settings of the map: labels that are paths, stored descriptors, fits, matching, and
+    how many queries are from elsewhere.
 
     After a change of the labels, its estimates have no levels until the next evaluation, which
     starts by itself if automatic evaluations are on. A change of `rows` applies to generations that
@@ -186,6 +195,8 @@ def update_map(gateway: GatewayDep, name: MapNamePath, body: UpdateMapRequest) -
             map_.auto_fit = body.auto_fit
         if body.matching is not None:
             map_.matching = body.matching
+        if body.elsewhere is not None:
+            map_.elsewhere = body.elsewhere
         active = active_generation(session, map_.id)
         is_on = body.matching == Matching.ON
         if is_on and active and count_features(session, active.id, detector).missing:
@@ -225,6 +236,7 @@ def _map_response(session: Session, settings: Settings, map_: Map) -> MapRespons
     statistics, counted_at = get_map_statistics(session, map_.id)
     return MapResponse.of_row(
         map_,
+        elsewhere=map_.elsewhere or ELSEWHERE_SHARE,
         photos=statistics.photos,
         searchable=statistics.searchable,
         failed_photos=statistics.failed_photos,

@@ -90,6 +90,7 @@ class SearchBody(_Finite):
     circles: list[CircleBody] = Field(max_length=10, description="finest first")
     not_in_map: Probability
     pose: PoseBody | None = None
+    headline: str = Field("", max_length=MAX_NAME, description="of the estimate")
 
 
 class DatedPhotoBody(_Finite):
@@ -209,8 +210,9 @@ def propose_positions(
         on_track = None
         if photo.time is not None and photo.time_zone_is_known:
             on_track = interpolate_position(track, photo.time, speed)
+        picture = _picture_evidence(sent.search, photo_count)
         proposal = propose_position(
-            _picture_evidence(sent.search, photo_count),
+            picture,
             neighbours.position_of(photo, speed),
             on_track,
             body.radius_m,
@@ -224,7 +226,7 @@ def propose_positions(
                 probability=proposal.probability if proposal else 0.0,
                 radius_68_m=proposal.radius_68_m if proposal else None,
                 heading=proposal.heading if proposal else None,
-                reason=proposal.reason if proposal else neighbours.why_unknown(photo),
+                reason=proposal.reason if proposal else neighbours.why_unknown(photo, picture),
             )
         )
     return ProposalsResponse(proposals=proposals)
@@ -245,4 +247,5 @@ def _picture_evidence(search: SearchBody | None, photo_count: int) -> PictureEvi
         search.not_in_map,
         photo_count,
         PosePosition(**search.pose.model_dump()) if search.pose else None,
+        search.headline,
     )

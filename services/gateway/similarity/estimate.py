@@ -52,6 +52,7 @@ def estimate_place(
             longitude=spot.longitude,
             place=spot.place,
             has_place=True,
+            elsewhere=elsewhere,
             headline="Best guess. How certain it is has not been measured yet.",
             reason=NOT_MEASURED,
         )

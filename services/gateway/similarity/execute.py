@@ -37,7 +37,7 @@ from shared.catalog.vocabularies import vocabulary_standing
 from shared.errors import Conflict, Gone, StorageFull
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH, RankedPhoto
 from shared.evaluation.places.levels import LevelScheme
-from shared.evaluation.places.probability import PlaceModel
+from shared.evaluation.places.probability import ELSEWHERE_SHARE, PlaceModel
 from shared.jobs import Job, JobState
 from shared.responses.similarity import (
     CameraPoseResponse,
@@ -360,6 +360,7 @@ def _estimate(
     found, whole_map = rankings.found, rankings.whole_map
     model, scheme = _place_model(search)
     certainty = search_params.certainty or settings.certainty
+    elsewhere = search_params.elsewhere or query.map.elsewhere or ELSEWHERE_SHARE
     neighbours = search.rank_neighbours(whole_map.hits[0].photo_id) if whole_map.hits else ()
     places = model.estimate(
         matches.add_to(whole_map.ranking),
@@ -368,13 +369,13 @@ def _estimate(
         certainty,
         settings.estimate_radius_m,
         matches.add_to(rankings.located.ranking),
-        search_params.elsewhere,
+        elsewhere,
     )
     similar = locate_hits(rankings.similar.hits[: search_params.top_k], rankings.similar.photos)
     if not any(ranked.location.is_known for ranked in similar):
         places = None  # the photos that it would be named after do not look like the query
     reason = _no_place_reason(found.hits, search_params.photos)
-    estimate = estimate_place(places, certainty, search_params.elsewhere, reason)
+    estimate = estimate_place(places, certainty, elsewhere, reason)
     if places is None or not model.is_fitted:
         return estimate, {}
     best = (hit.photo_id for hit in rankings.located.hits)

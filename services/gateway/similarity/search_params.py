@@ -15,7 +15,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from services.gateway.dependencies import MapParams
 from shared.errors import invalid_field_error
-from shared.evaluation.places.probability import ELSEWHERE_SHARE
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS, parse_tags, parse_time
 from shared.search_api.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
 from shared.search_api.protocol import MAX_MATCHED_PHOTOS, Mode
@@ -178,11 +177,12 @@ class RankingParams(BaseModel):
         description="Form of the answer to `Accept: application/geopose+json`: Basic-Quaternion or "
         "Basic-YPR of OGC GeoPose 1.0.",
     )
-    elsewhere: float = Field(
-        ELSEWHERE_SHARE,
+    elsewhere: float | None = Field(
+        None,
         gt=0,
         lt=1,
-        description="Share of your queries that are from elsewhere than the map.",
+        description="Share of your queries that are from elsewhere than the map. Default: the "
+        "map's `elsewhere`.",
     )
     certainty: float | None = Field(
         None,

@@ -152,10 +152,12 @@ async function search(photo, map, signal) {
   // Photos of the map without coordinates, such as this one, hide those that have some.
   const { similar_images: similar } = found.matches_without_place ? await find({ box: WITH_COORDINATES }) : found;
   const { estimate, pose } = found;
+  const named = estimate.has_place || estimate.levels.length > 0;
   photo.search = {
-    similar: similar.filter(({ latitude }) => latitude !== null).map((match) => ({ name: nameOf(match), latitude: match.latitude, longitude: match.longitude, score: match.similarity_score })),
+    similar: similar.filter(({ latitude }) => named && latitude !== null).map((match) => ({ name: nameOf(match), latitude: match.latitude, longitude: match.longitude, score: match.similarity_score })),
     circles: estimate.levels.filter(({ radius_m: radius }) => radius !== null).map(({ latitude, longitude, radius_m, probability }) => ({ latitude, longitude, radius_m, probability })),
-    not_in_map: estimate.not_in_map_probability ?? 0.02,
+    not_in_map: estimate.not_in_map_probability ?? estimate.elsewhere ?? 1,
+    headline: estimate.headline,
     pose: pose?.radius_68_m == null ? null : { latitude: pose.latitude, longitude: pose.longitude, radius_68_m: pose.radius_68_m, heading: pose.heading },
   };
 }

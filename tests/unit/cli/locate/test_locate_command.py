@@ -399,8 +399,14 @@ def answer(**changes: Any) -> dict[str, Any]:
         {"latitude": LATITUDE, "longitude": LONGITUDE, "radius_m": radius, "probability": 0.97}
         for radius in (25.0, 100.0)
     ]
-    estimate = {"headline": "", "reason": "", "levels": levels, "not_in_map_probability": 0.01}
-    return {**SIMILAR, "similar_images": [similar], "estimate": estimate, **changes}
+    return {**SIMILAR, "similar_images": [similar], "estimate": estimate(0.01, levels), **changes}
+
+
+def estimate(
+    not_in_map: float | None, levels: list[dict[str, Any]], **fields: Any
+) -> dict[str, Any]:
+    stated = {"levels": levels, "not_in_map_probability": not_in_map, "has_place": True}
+    return {"headline": "", "reason": "", **stated, **fields}
 
 
 def will_find(server: FakeServer, *answers: dict[str, Any]) -> None:
@@ -431,6 +437,23 @@ def test_a_photo_of_the_map_without_coordinates_does_not_hide_the_others(
     assert parse_qs(urlsplit(second_search).query)["box"] == ["-90,-180,90,180"]
 
 
+def test_a_photo_that_the_estimate_names_no_place_for_has_its_headline_instead_of_a_position(
+    folder: Path, server: FakeServer
+) -> None:
+    (folder / "day 1" / "2.jpg").unlink()
+    level = {"latitude": LATITUDE, "longitude": LONGITUDE, "radius_m": 25.0, "probability": 0.2}
+    outside = estimate(0.8, [level], has_place=False, headline="Probably not in this map: 80 %")
+    unlocated = estimate(None, [], has_place=False, headline="The photos have no coordinates.")
+    for told in (outside, unlocated):
+        will_find(server, answer(estimate=told))
+        found = searched_proposals(server, folder)["4.jpg"]
+        assert (found["position"], found["place"]) == (None, None)
+        assert found["why_unknown"] == told["headline"]
+    will_find(server, answer(estimate=estimate(None, [], elsewhere=0.33)))
+    unmeasured = searched_proposals(server, folder)["4.jpg"]["position"]
+    assert 0.3 < unmeasured["probability"] <= 0.67, "no surer than that it is of the map at all"
+
+
 def test_what_a_preview_has_shown_is_written_although_the_map_answers_differently_since(
     folder: Path, server: FakeServer
 ) -> None:
@@ -438,7 +461,7 @@ def test_what_a_preview_has_shown_is_written_although_the_map_answers_differentl
     shown = searched_proposals(server, folder)
     (folder / "new.jpg").write_bytes(photo(None))
     sure = [{"latitude": 44.0, "longitude": 7.0, "radius_m": 25.0, "probability": 1.0}]
-    will_find(server, answer(estimate={"headline": "", "reason": "", "levels": sure}))
+    will_find(server, answer(estimate=estimate(0.0, sure)))
     written = searched(server, folder, "--write", "csv")
     assert written.exit_code == 0, written.output
     assert "1 proposals are not as they were accepted then" in written.stderr
@@ -465,7 +488,7 @@ def test_no_photo_of_a_preview_is_searched_again_unless_it_has_changed_or_a_day_
     assert written.stdout == shown.stdout
     assert "All proposals are as they were then." in written.stderr
     (folder / "4.jpg").write_bytes(photo(26, camera="another"))
-    will_find(server, answer(estimate={"headline": "", "reason": "", "levels": []}))
+    will_find(server, answer(estimate=estimate(None, [])))
     written = searched(server, folder, "--write", "csv")
     assert written.stderr.rstrip().endswith(": 4.jpg")
     old = datetime.now(UTC) - preview.KEPT_FOR
@@ -477,11 +500,11 @@ def test_no_photo_of_a_preview_is_searched_again_unless_it_has_changed_or_a_day_
 
 
 def test_a_map_with_labels_only_gives_places(folder: Path, server: FakeServer) -> None:
-    levels = [{"place": "tower/floor 7", "probability": 0.96}, {"place": "tower", "probability": 1}]
+    levels: list[dict[str, Any]] = [
+        {"place": "tower/floor 7", "probability": 0.96}, {"place": "tower", "probability": 1},
+    ]  # fmt: skip
     unlocated = {**PHOTO, "latitude": None, "place": "tower/floor 7", "similarity_score": 0.9}
-    by_label = answer(
-        similar_images=[unlocated], estimate={"headline": "", "reason": "", "levels": levels}
-    )
+    by_label = answer(similar_images=[unlocated], estimate=estimate(0.0, levels))
     will_find(server, by_label, by_label)
     found = searched_proposals(server, folder)["4.jpg"]
     assert (found["place"], found["accepted"], found["position"]) == ("tower/floor 7", True, None)
@@ -530,7 +553,7 @@ def test_a_place_that_is_not_probable_enough_is_not_written_with_the_position(
     folder: Path, server: FakeServer
 ) -> None:
     levels = [{"place": "tower/floor 7", "probability": 0.3}]
-    unsure = answer(estimate={"headline": "", "reason": "", "levels": levels})
+    unsure = answer(estimate=estimate(0.4, levels))
     will_find(server, unsure, unsure)
     found = searched_proposals(server, folder)["day 1/2.jpg"]
     place = (found["accepted"], found["place"], found["place_probability"])
