@@ -15,6 +15,7 @@ from uuid import UUID
 from pydantic import BaseModel, ConfigDict, Field
 
 from shared.config.shards import SINGLE_SHARD
+from shared.geometry.colmap_model import ColmapCamera
 from shared.responses.similarity import PointPair, SeenPoint
 from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
 
@@ -240,6 +241,8 @@ class PoseRequest(_Message):
     camera_source: str
     """where `focal_length` comes from: a `shared.geometry.cameras.CameraSource`. A focal length of
     EXIF that a candidate has, too, is that of its camera, which was refined with the model"""
+    camera: ColmapCamera | None = None
+    """that took the query, if its parameters were sent with it"""
     camera_key: str | None = None
     """`PhotoHeader.camera_key` of the query"""
     quarter_turns: int = 0

@@ -59,6 +59,7 @@ from shared.storage.chunks import features_key
 log = logging.getLogger(__name__)
 
 WITH_PLACE = PhotoFilter(has_place=True)
+HINTED_PHOTOS = 10  # half of those that a pose is computed from: a hint may be wrong
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +191,8 @@ def run_similarity_search(
     # Along coordinates, queries of another season look as if they were not in the map.
     is_labelled = bool(estimate.levels) and estimate.levels[0].radius_m is None
     is_missing = is_labelled and estimate.in_map is False
-    pose = find_pose(gateway, query, rankings.found.hits, search_params, is_missing=is_missing)
+    candidates = _pose_candidates(search, rankings, search_params)
+    pose = find_pose(gateway, query, candidates, search_params, is_missing=is_missing)
     similar = rankings.similar
     if isinstance(pose, CameraPoseResponse):
         estimate = place_at_pose(estimate, pose)
@@ -328,6 +330,17 @@ def _rank_photos(search: _MapSearch, search_params: SearchParams) -> _Rankings:
     least = -1.0 if search_params.min_score is None else search_params.min_score
     similar = [hit for hit in found.hits[:depth] if hit.score >= least]
     return _Rankings(found, located, whole_map, replace(found, hits=similar))
+
+
+def _pose_candidates(
+    search: _MapSearch, rankings: _Rankings, search_params: SearchParams
+) -> list[SearchHit]:
+    """Return the photos that may show what the query shows: those of its hint come first."""
+    hits = rankings.found.hits
+    if search_params.hint is not None:
+        there = search_params.photos.model_copy(update={"near": search_params.hint})
+        hits = [*search.find(there, HINTED_PHOTOS).hits, *hits]
+    return list({hit.photo_id: hit for hit in hits}.values())
 
 
 def _match_best_photos(

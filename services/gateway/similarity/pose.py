@@ -90,6 +90,7 @@ def find_pose(
         components=tuple(map(_to_message, components)),
         focal_length=search_params.focal_length or query.focal_length,
         camera_source=CameraSource.GIVEN if search_params.focal_length else source,
+        camera=search_params.camera,
         camera_key=query.camera_key,
         quarter_turns=query.quarter_turns,
         leave_out=(query.photo_id,) if query.photo_id else (),
