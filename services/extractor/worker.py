@@ -45,6 +45,7 @@ from shared.catalog.jobs import (
 )
 from shared.catalog.processes import PROCESS_HEARTBEAT_SECONDS, list_processes
 from shared.config.settings import Settings
+from shared.descriptors.extractor import choose_device
 from shared.errors import PlacewiseError
 from shared.jobs import Job, Priority, Wakeups
 from shared.jobs.claim import fair_batch_size, mark_started
@@ -108,6 +109,7 @@ class ExtractorWorker:
         As the `only_worker`, so that none can be of another release, it reindexes outdated
         generations.
         """
+        settings = settings.for_device(choose_device(settings.device).type)
         self._metrics = ExtractorMetrics(registry or CollectorRegistry())
         self._heartbeat = Heartbeat(settings.heartbeat_file)
         self._only_worker = only_worker
