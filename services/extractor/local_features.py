@@ -49,6 +49,8 @@ class BatchFeatures:
 
     def detect(self) -> None:
         """Detect the features of the photos added."""
+        if not self._photos:
+            return
         photos = list(self._photos.values())
         found = self.detector.detect(
             [photo.detection_pixels for photo in photos if photo.detection_pixels is not None],
