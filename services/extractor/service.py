@@ -64,7 +64,7 @@ def _run_extractor(
         ) as worker,
         process_heartbeat(catalog, "extractor", worker.state),
     ):
-        node = CeleryNode(app, settings, name, wakeups, worker.state)
+        node = CeleryNode(app, worker.context.settings, name, wakeups, worker.state)
 
         def run_jobs(stop: threading.Event) -> None:
             worker.warm_up(stop)

@@ -19,7 +19,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 import numpy as np
 import torch
@@ -29,6 +29,8 @@ from shared.extractor_config.configs import ExtractorConfig
 from shared.imaging.preprocessing import Pixels
 
 log = logging.getLogger(__name__)
+
+Result = TypeVar("Result")
 
 DEFAULT_PHOTO_PIXELS = 224 * 224  # the pixels of one photo, for the default size of a batch
 # A CPU's cache keeps the layers of so many pixels. With 16 photos of 256 x 448 pixels at once,
@@ -109,10 +111,10 @@ class BatchSizeLimit:
 
 def run_in_batches(
     photos: Collection[Pixels],
-    run: Callable[[Pixels], torch.Tensor],
+    run: Callable[[Pixels], Result],
     limit: BatchSizeLimit,
     device: torch.device,
-) -> Iterator[tuple[list[int], torch.Tensor]]:
+) -> Iterator[tuple[list[int], Result]]:
     """Run `run` on batches of photos of the same size; halve the batch when memory runs out.
 
     Args:
@@ -147,8 +149,8 @@ def run_in_batches(
 
 
 def _run_unless_out_of_memory(
-    run: Callable[[Pixels], torch.Tensor], pixels: Pixels, device: torch.device
-) -> torch.Tensor | None:
+    run: Callable[[Pixels], Result], pixels: Pixels, device: torch.device
+) -> Result | None:
     """Return None if the GPU runs out of memory."""
     with _gpu_lock if device.type == "cuda" else contextlib.nullcontext():
         try:

@@ -83,6 +83,7 @@ def check_memory(settings: Settings) -> str:
     if config.parameters is None or config.preprocessing is None:
         return f"the size of {config.name} is unknown until it is loaded"
     device = choose_device(settings.device)
+    settings = settings.for_device(device.type)
     if device.type == "cuda":
         available, owner = torch.cuda.get_device_properties(device).total_memory, "the GPU"
     else:

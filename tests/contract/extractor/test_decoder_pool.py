@@ -11,6 +11,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from services.extractor.decoder_pool import (
     SCHEDULED_PER_PROCESS,
     DecoderPool,
 )
+from services.extractor.decoder_process import decode_into_memory
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, Unavailable, Unprocessable
 from shared.imaging.decode import DecodedPhoto
@@ -201,6 +203,30 @@ def test_photos_of_a_decoder_that_the_system_kills_are_decoded_by_another(
         outcomes = pool.decode([GOOD] * 3, SQUARE)
     assert all(is_good(outcome) for outcome in outcomes)
     assert in_child(pool, "__import__('os').getpid()") != before
+
+
+def test_process_whose_photo_nobody_waits_for_writes_to_no_other_file(
+    pool: DecoderPool, tmp_path: Path
+) -> None:
+    other = tmp_path / "catalog.db"
+    other.write_bytes(b"rows")
+    with other.open("rb") as file:
+        arguments = [bytes, GOOD, file.fileno(), "photo-of-before"]
+        with pytest.raises(FileNotFoundError, match="photo-of-before"):
+            pool._pool.schedule(decode_into_memory, args=arguments).result()
+    assert other.read_bytes() == b"rows"
+
+
+def test_memory_is_released_when_a_batch_ends_early(pool: DecoderPool) -> None:
+    def photos() -> Iterator[bytes]:
+        yield GOOD
+        raise Unavailable("store_unavailable", "The object store is away.")
+
+    pool.decode([GOOD], SQUARE)
+    with pytest.raises(Unavailable, match="away"):
+        pool.decode(photos(), SQUARE)
+    files = [str(file.resolve()) for file in Path("/proc/self/fd").iterdir()]
+    assert not [file for file in files if "photo-" in file]
 
 
 def test_broken_decoder_pool_is_replaced(pool: DecoderPool) -> None:
