@@ -30,7 +30,7 @@ from shared.search_api.protocol import SearchRequest
 from shared.storage import FolderStore, read_retries
 from shared.storage.chunks import encode_rows
 from shared.storage.keys import QUERIES
-from tests.integration.workplace import Workplace
+from tests.integration.harness import Harness
 from tests.support.catalog_rows import failure_code
 from tests.support.photos import photo_bytes
 from tests.support.waiting import wait_until
@@ -83,20 +83,20 @@ def register(catalog: Catalog, store: FolderStore, settings: Settings) -> Regist
 
 
 @pytest.fixture
-def fitted(vlads: Workplace) -> Workplace:
+def fitted(vlads: Harness) -> Harness:
     """A map with a vocabulary and PHOTOS described photos."""
     vlads.upload(*range(PHOTOS))
     assert vlads.fit().state == JobState.SUCCEEDED
     return vlads
 
 
-def complete(workplace: Workplace) -> tuple[UUID, UUID]:
+def complete(harness: Harness) -> tuple[UUID, UUID]:
     """A model change up to where all photos are described; its job and its generation."""
-    job_id, generation_id = workplace.build(seed=1)
+    job_id, generation_id = harness.build(seed=1)
     for _ in range(3):
-        workplace.advance()
-        workplace.drain()
-    workplace.advance()
+        harness.advance()
+        harness.drain()
+    harness.advance()
     return job_id, generation_id
 
 
@@ -118,13 +118,13 @@ def age(catalog: Catalog, name: str, seconds: float) -> None:
         )
 
 
-def found(registered: Registered, workplace: Workplace, generation: Generation) -> set[UUID]:
+def found(registered: Registered, harness: Harness, generation: Generation) -> set[UUID]:
     """The photos that the worker answers for the generation."""
     key = f"{QUERIES}{generation.id}.npy"
-    row = next(iter(workplace.rows(generation.id).values()))
-    workplace.store.put(key, encode_rows(row[None]))
-    with workplace.catalog.read() as session:
-        version = session.get_one(Map, workplace.map_id).version
+    row = next(iter(harness.rows(generation.id).values()))
+    harness.store.put(key, encode_rows(row[None]))
+    with harness.catalog.read() as session:
+        version = session.get_one(Map, harness.map_id).version
     request = SearchRequest(
         generation_id=generation.id,
         object_key=key,
@@ -139,7 +139,7 @@ def found(registered: Registered, workplace: Workplace, generation: Generation) 
 
 
 def test_a_generation_is_switched_in_once_the_slow_worker_has_loaded_it_too(
-    fitted: Workplace, register: Register, store: FolderStore
+    fitted: Harness, register: Register, store: FolderStore
 ) -> None:
     slow_store = HaltingStore(store)
     slow_store.go_on.set()
@@ -181,7 +181,7 @@ def test_a_generation_is_switched_in_once_the_slow_worker_has_loaded_it_too(
 
 
 def test_a_switch_does_not_wait_for_a_dead_search_worker(
-    fitted: Workplace, register: Register, catalog: Catalog
+    fitted: Harness, register: Register, catalog: Catalog
 ) -> None:
     living, dying = register("living"), register("dying")
     job_id, new_id = complete(fitted)
@@ -198,7 +198,7 @@ def test_a_switch_does_not_wait_for_a_dead_search_worker(
 
 
 def test_a_switch_waits_for_a_live_search_worker_that_has_not_loaded_and_names_it(
-    fitted: Workplace, register: Register, catalog: Catalog, caplog: pytest.LogCaptureFixture
+    fitted: Harness, register: Register, catalog: Catalog, caplog: pytest.LogCaptureFixture
 ) -> None:
     register("stuck-b")
     register("stuck-a")
@@ -222,7 +222,7 @@ def test_a_switch_waits_for_a_live_search_worker_that_has_not_loaded_and_names_i
 
 @pytest.mark.parametrize("damage", ["truncated", "gone"])
 def test_a_damaged_chunk_of_what_is_built_is_described_again_and_then_switched_in(
-    fitted: Workplace, register: Register, monkeypatch: pytest.MonkeyPatch, damage: str
+    fitted: Harness, register: Register, monkeypatch: pytest.MonkeyPatch, damage: str
 ) -> None:
     worker = register("worker")
     job_id, new_id = complete(fitted)
@@ -252,7 +252,7 @@ def test_a_damaged_chunk_of_what_is_built_is_described_again_and_then_switched_i
 
 
 def test_a_chunk_that_only_its_worker_can_not_read_is_kept_and_loaded_before_the_switch(
-    fitted: Workplace, register: Register, monkeypatch: pytest.MonkeyPatch
+    fitted: Harness, register: Register, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
     worker = register("worker")
@@ -272,7 +272,7 @@ def test_a_chunk_that_only_its_worker_can_not_read_is_kept_and_loaded_before_the
 
 
 def test_a_model_change_whose_chunks_are_damaged_again_and_again_fails(
-    fitted: Workplace, register: Register, monkeypatch: pytest.MonkeyPatch
+    fitted: Harness, register: Register, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(generation_repair, "MAX_REPAIRED_CHUNKS", 0)
     monkeypatch.setattr(model_changes, "SLOW_LOAD_SECONDS", 0.0)
@@ -287,7 +287,7 @@ def test_a_model_change_whose_chunks_are_damaged_again_and_again_fails(
 
 
 def test_a_switch_does_not_wait_for_a_shard_without_rows(
-    fitted: Workplace, register: Register
+    fitted: Harness, register: Register
 ) -> None:
     first = register("first", "0/2")  # every photo is in slot 0
     register("second", "1/2")
@@ -299,7 +299,7 @@ def test_a_switch_does_not_wait_for_a_shard_without_rows(
 
 
 def test_a_photo_that_comes_while_search_loads_is_described_before_the_switch(
-    fitted: Workplace, register: Register
+    fitted: Harness, register: Register
 ) -> None:
     worker = register("worker")
     job_id, new_id = complete(fitted)
