@@ -23,13 +23,7 @@ from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.config.settings import Settings
 from shared.descriptors.backbones import Backbone
 from shared.descriptors.extractor import Extractor, choose_device, spec_fingerprint
-from shared.descriptors.inference import (
-    PRECISIONS,
-    BatchSizeLimit,
-    Precision,
-    choose_precision,
-    gpu_too_small_error,
-)
+from shared.descriptors.inference import PRECISIONS, BatchSizeLimit, Precision, choose_precision
 from shared.descriptors.pca_whitening import PcaProjection, decode_whitening
 from shared.descriptors.side_by_side import SideBySideExtractor
 from shared.descriptors.vocabulary import ClusterCentres, decode_centres
@@ -112,9 +106,6 @@ class ModelRegistry:
         """Show in `state` whether the model called `name` could be loaded in the block."""
         try:
             yield
-        except torch.cuda.OutOfMemoryError as error:
-            self._load_errors[name] = gpu_too_small_error(name)
-            raise self._load_errors[name] from error
         except PlacewiseError as error:
             self._load_errors[name] = error
             raise

@@ -23,7 +23,6 @@ from shared.descriptors.inference import (
     PhotoTooLargeForGpu,
     Precision,
     autocast,
-    gpu_too_small_error,
     run_in_batches,
 )
 from shared.descriptors.pca_whitening import PcaProjection
@@ -171,7 +170,12 @@ class Extractor:
             for _ in self._run_in_batches(blank, lambda features: features):
                 pass
         except PhotoTooLargeForGpu as error:
-            raise gpu_too_small_error(self.config.name) from error
+            raise Misconfigured(
+                "gpu_out_of_memory",
+                f"After loading the weights of {self.config.name}, the GPU has no memory left for "
+                "a single photo. Check what else uses the GPU (`nvidia-smi`), or configure a "
+                "smaller extractor or DEVICE=cpu.",
+            ) from error
 
     def features(self, pixels: Pixels) -> torch.Tensor:
         """Compute (B, patches, width) float32 features of (B, H, W, 3) pixels, on the device."""

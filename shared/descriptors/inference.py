@@ -24,7 +24,7 @@ from typing import Literal, TypeVar, get_args
 import numpy as np
 import torch
 
-from shared.errors import Misconfigured, Unprocessable
+from shared.errors import Unprocessable
 from shared.extractor_config.configs import ExtractorConfig
 from shared.imaging.preprocessing import Pixels
 
@@ -67,15 +67,6 @@ class PhotoTooLargeForGpu(Unprocessable):
         )
         error.place = place
         return error
-
-
-def gpu_too_small_error(name: str) -> Misconfigured:
-    """Return the error for a network that leaves no memory for a single photo."""
-    return Misconfigured(
-        "gpu_out_of_memory",
-        f"Beside the weights of {name}, the GPU has no memory left for a single photo. Check what "
-        "else uses the GPU (`nvidia-smi`), or configure a smaller extractor or DEVICE=cpu.",
-    )
 
 
 class BatchSizeLimit:

@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import torch
 
 from services.extractor.model_registry import MAX_EXTRACTORS, ModelRegistry
 from shared.config.settings import Settings
-from shared.descriptors.backbones.synthetic import TinyBackbone
 from shared.errors import Misconfigured
 from shared.storage import FolderStore
 from tests.support.checkpoints import none_added
@@ -40,22 +38,6 @@ def test_extractors_used_least_lately_are_let_go(models: ModelRegistry) -> None:
     for clusters in range(2, MAX_EXTRACTORS + 2):
         models.extractor(f"test-tiny-vlad:clusters={clusters}")
     assert models.extractor("test-tiny-vlad:clusters=1") is not first
-
-
-def test_a_gpu_without_memory_for_the_weights_is_an_error_of_the_model(
-    models: ModelRegistry, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def load(*_: object) -> None:
-        raise torch.cuda.OutOfMemoryError("CUDA out of memory")
-
-    with monkeypatch.context() as patched:
-        patched.setattr(TinyBackbone, "load", load)
-        with pytest.raises(Misconfigured, match="the weights of test-tiny-avg") as caught:
-            models.extractor("test-tiny-avg")
-    assert caught.value.code == "gpu_out_of_memory"
-    assert models.state["errors"] == {"test-tiny-avg": "gpu_out_of_memory"}
-    models.extractor("test-tiny-avg")
-    assert models.state["errors"] == {}
 
 
 def test_code_that_is_no_longer_allowed_is_not_executed(
