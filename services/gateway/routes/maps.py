@@ -71,7 +71,8 @@ MATCHING = (
 )
 
 
-ELSEWHERE = "share of its queries that are from elsewhere, where a request does not say it"
+ELSEWHERE = f"share of its queries from elsewhere, where a request has none ({ELSEWHERE_SHARE})"
+Share = Annotated[float, Field(gt=0, lt=1, description=ELSEWHERE)]
 
 
 class CreateMapRequest(RequestModel):
@@ -94,9 +95,7 @@ class CreateMapRequest(RequestModel):
     )
     auto_fit: bool = Field(True, description=AUTO_FIT)
     matching: Matching = Field(Matching.AUTO, description=MATCHING)
-    elsewhere: float | None = Field(
-        None, gt=0, lt=1, description=f"{ELSEWHERE}; omitted: {ELSEWHERE_SHARE}"
-    )
+    elsewhere: Share | None = None
 
     @field_validator("name")
     @classmethod
@@ -125,9 +124,7 @@ class UpdateMapRequest(RequestModel):
         description=f"{MATCHING}. `on` starts a model change if photos have no local features yet; "
         "omitted: unchanged",
     )
-    elsewhere: float | None = Field(
-        None, gt=0, lt=1, description=f"{ELSEWHERE}; omitted: unchanged"
-    )
+    elsewhere: Share | None = None
 
 
 class LocalFeaturesResponse(ResponseModel):
