@@ -33,7 +33,7 @@ from lab.benchmarks.estimates import (
 from lab.benchmarks.report import Report, printed_report
 from services.cli.output import JsonOption
 from shared.evaluation.places.evidence import match_support
-from shared.matching.detectors import Detector, detect_features, load_detector
+from shared.matching.detectors import Detector, load_detector
 from shared.matching.features import WORKING_SIDE, LocalFeatures
 from shared.matching.lightglue import LightGlueMatcher
 from shared.matching.matchers import Matcher, MutualNearest
@@ -101,7 +101,7 @@ def detect_all(
 ) -> tuple[list[LocalFeatures], float]:
     """Return the local features of photos, and the CPU seconds of their detection."""
     torch.set_num_threads(1)
-    features, seconds = [], 0.0
+    features, seconds = list[LocalFeatures](), 0.0
     for path in paths:
         with Image.open(path) as image:
             upright = ImageOps.exif_transpose(image).convert("RGB")
@@ -109,7 +109,7 @@ def detect_all(
         size = (round(upright.width * scale), round(upright.height * scale))
         pixels = np.array(upright.resize(size, Image.Resampling.BILINEAR, reducing_gap=2.0))
         started = time.process_time()
-        features.append(detect_features(detector, pixels, upright.size))
+        features += detector.detect([pixels], [upright.size])
         seconds += time.process_time() - started
         on_photo()
     return features, seconds

@@ -112,6 +112,7 @@ def create_app(gateway: GatewayContext) -> FastAPI:
         limits={
             f"{API_PREFIX}{positions.POSITIONS_PATH}": positions.MAX_BODY_BYTES,
             f"{API_PREFIX}{reconstructions.IMPORT_PATH}": reconstructions.MAX_MODEL_BYTES,
+            f"{API_PREFIX}{similarity.GEOPOSE_PATH}": similarity.MAX_GEOPOSE_BYTES,
         },
     )
     app.add_middleware(RateLimitMiddleware, limiter=app.state.rate_limiter)

@@ -131,6 +131,11 @@ def _camera(
     and distortion, too, which a focal length that is given leaves as they are.
     """
     size = query.width, query.height
+    if sent := request.camera:
+        camera = Camera.of_parameters(sent.model, sent.params, (sent.width, sent.height))
+        assert camera.rays is not None
+        camera = replace(camera, rays=camera.rays.turned(request.quarter_turns))
+        return camera.resized(*size), CameraSource.GIVEN
     known = _find_camera(request, size, components)
     if request.focal_length is not None and request.camera_source == CameraSource.GIVEN:
         if known is None or known.rays is None:

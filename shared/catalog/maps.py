@@ -13,7 +13,6 @@ from __future__ import annotations
 import time
 from dataclasses import asdict, dataclass
 from datetime import datetime
-from enum import StrEnum
 from typing import Any
 from uuid import UUID
 
@@ -53,6 +52,7 @@ from shared.catalog.photos import (
     is_geotagged,
     select_live_photos,
 )
+from shared.enums import Matching as Matching
 from shared.errors import Conflict, NotFound
 from shared.ids import new_id
 from shared.place_paths import look_like_paths
@@ -60,14 +60,6 @@ from shared.place_paths import look_like_paths
 DEFAULT_MAP = "default"
 MAP_NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 DELETED_NAME_PREFIX = "deleted/"  # valid names of maps have no slash
-
-
-class Matching(StrEnum):
-    """Whether local features of a map's photos are computed and matched."""
-
-    AUTO = "auto"  # until an evaluation has shown that they do not improve the answers
-    ON = "on"
-    OFF = "off"
 
 
 class Map(Journaled, Base):

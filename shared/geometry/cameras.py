@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any
@@ -38,6 +38,17 @@ class CameraSource(StrEnum):
     """from the matches, together with the pose"""
 
 
+CAMERA_PARAMETERS = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+}
+"""Models of COLMAP that a query may name, with their parameters in pixels"""
+UNDISTORTIONS = 20
+"""Fixed-point iterations, as OpenCV's undistortPoints makes five of"""
 RAY_TERMS = 10
 """Chebyshev polynomials along each side of a photo: a third of a pixel off at wide lenses' edges"""
 MAX_RAY_ANGLE = math.radians(75)
@@ -136,6 +147,39 @@ class Camera:
     def of_focal_length(cls, width: int, height: int, focal_length: float) -> Camera:
         """Return a camera without distortion; `focal_length` is a multiple of the longer side."""
         return cls(width, height, focal_length * max(width, height))
+
+    @classmethod
+    def of_parameters(cls, model: str, values: Sequence[float], size: tuple[int, int]) -> Camera:
+        """Return the camera of CAMERA_PARAMETERS for photos of this width and height.
+
+        Raises:
+            ValueError: The model is another one, or has another number of parameters.
+        """
+        if model not in CAMERA_PARAMETERS:
+            raise ValueError(f"{model!r} is none of {', '.join(CAMERA_PARAMETERS)}")
+        names = CAMERA_PARAMETERS[model].split()
+        focals = values[: sum(name.startswith("f") for name in names)]
+        if len(values) != len(names) or min(focals) <= 0:
+            raise ValueError(f"{model} has {len(names)} parameters: {', '.join(names)}")
+        given = dict.fromkeys(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), 0.0)
+        given |= dict(zip(names, values, strict=True))
+        focal = np.array([given.get("fx", given.get("f")), given.get("fy", given.get("f"))])
+        k1, k2, p1, p2, k3, k4, k5, k6 = (given[name] for name in list(given)[:8])
+
+        def look(pixels: Floats) -> Floats:
+            plane = distorted = (pixels - (given["cx"], given["cy"])) / focal
+            for _ in range(UNDISTORTIONS):
+                square = np.sum(plane**2, axis=1, keepdims=True)
+                radial = 1 + square * (k1 + square * (k2 + square * k3))
+                radial /= 1 + square * (k4 + square * (k5 + square * k6))
+                product = np.prod(plane, axis=1, keepdims=True)
+                tangential = 2 * product * (p1, p2) + (square + 2 * plane**2) * (p2, p1)
+                plane = (distorted - tangential) / radial
+            return np.column_stack([plane, np.ones(len(plane))])
+
+        focal_length = float(focal.mean()) / max(size)
+        rays = Rays.fit(look, size, focal_length, bytes(32), 0)
+        return replace(cls.of_focal_length(*size, focal_length), rays=rays)
 
     @property
     def focal_length(self) -> float:

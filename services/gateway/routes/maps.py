@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import re
-from datetime import datetime
 from typing import Annotated, Literal
-from uuid import UUID
 
 from fastapi import APIRouter, Depends, Path, Request
 from pydantic import Field, field_validator
@@ -15,7 +13,6 @@ from services.gateway.authentication import READ, WRITE, get_caller
 from services.gateway.dependencies import ALL_MAPS, NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep
 from services.gateway.idempotency import IdempotentDep
 from services.gateway.json_bodies import JsonRoute
-from services.gateway.schemas import ResponseModel
 from shared.catalog.chunks import count_features, find_features_model
 from shared.catalog.generations import Generation, RowType, active_generation
 from shared.catalog.jobs import UNFINISHED_STATES, list_jobs
@@ -40,15 +37,22 @@ from shared.errors import Misconfigured, invalid_field_error
 from shared.evaluation.places.fit import MIN_OWN_PHOTOS
 from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import ELSEWHERE_SHARE, PlaceModel
-from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.http.request_model import RequestModel
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.model_changes import get_unfinished_model_change, start_reindex
 from shared.jobs.transitions import cancel_jobs
+from shared.responses.maps import (
+    AUTO_FIT,
+    ELSEWHERE,
+    MATCHING,
+    DeletedMapResponse,
+    LocalFeaturesResponse,
+    MapResponse,
+    Measurement,
+)
 
 router = APIRouter(tags=["maps"], dependencies=[NO_PARAMETERS], route_class=JsonRoute)
 
-Measurement = Literal["measured", "running", "due", "not_measured", "too_few_photos"]
 MapNamePath = Annotated[
     str, Path(description="the map's name", min_length=1, max_length=100, pattern=NO_NUL_PATTERN)
 ]
@@ -61,17 +65,6 @@ async def _check_map(request: Request, name: MapNamePath) -> None:
 CHECK_MAP = Depends(_check_map)
 
 
-AUTO_FIT = (
-    f"whether a vocabulary is fitted automatically: at {MIN_PHOTOS_TO_FIT} photos, and whenever "
-    "the map has doubled since the last fit. Importing or choosing a vocabulary sets it to false"
-)
-MATCHING = (
-    "whether local features of its photos are computed and matched: `on`, `off`, or `auto`: until "
-    "an evaluation finds that matches do not improve the answers"
-)
-
-
-ELSEWHERE = f"share of its queries from elsewhere, where a request has none ({ELSEWHERE_SHARE})"
 Share = Annotated[float, Field(gt=0, lt=1, description=ELSEWHERE)]
 
 
@@ -125,75 +118,6 @@ class UpdateMapRequest(RequestModel):
         "omitted: unchanged",
     )
     elsewhere: Share | None = None
-
-
-class LocalFeaturesResponse(ResponseModel):
-    model: str | None = Field(description="detector and its version, `xfeat@0f5187fd7bed`")
-    photos: int = Field(description="photos with local features; deleted ones may be among them")
-    missing: int = Field(description="searchable photos without")
-    bytes: int
-    used: bool | None = Field(
-        description="whether searches use matches as evidence; null until an evaluation decides it"
-    )
-
-
-class MapResponse(ResponseModel):
-    name: str
-    extractor: str
-    version: int = Field(description="incremented by every change of the searchable photos")
-    photos: int
-    searchable: int
-    failed_photos: int = Field(
-        description="stored photos that can't be searched for, because their description failed: "
-        "GET /search?failed=true lists them, and the next model change describes them again"
-    )
-    labelled_queries: int
-    located: int = Field(description="searchable photos with coordinates or a label")
-    measurement: Measurement = Field(
-        description="whether it is known how certain the map's estimates are: `measured` by an "
-        "evaluation; `running`: it is being evaluated; `due`: an evaluation will start by itself; "
-        "`not_measured`: start one (POST /evaluations); `too_few_photos`: it takes 20 with "
-        "coordinates or a label"
-    )
-    counted_at: datetime = Field(description="when the four counts above were computed")
-    generation_id: UUID | None
-    vocabulary: str | None = Field(
-        description="`own`, `provisional`, `foreign`, `pending` or `none`; null before the first "
-        "photo"
-    )
-    dimension: int | None = Field(
-        description="dimension of its descriptors; null before the first photo"
-    )
-    pca_from: int | None = Field(description="dimension before PCA; null without PCA")
-    place_labels_are_paths: bool = Field(
-        description="whether `/` separates the levels of place labels"
-    )
-    place_labels_are_automatic: bool = Field(
-        description="whether evaluations decide that by the labels"
-    )
-    rows: RowType = Field(
-        validation_alias="row_type",
-        description="type of the stored descriptors, `float32` or `float16`, of new generations; "
-        "GET /generations has the one of each generation",
-    )
-    auto_fit: bool = Field(description=AUTO_FIT)
-    matching: Matching = Field(description=MATCHING)
-    elsewhere: float = Field(description=ELSEWHERE)
-    local_features: LocalFeaturesResponse | None = Field(
-        description="local features of the active generation; null before the first photo"
-    )
-    model_change_id: UUID | None = Field(description="job of the running model change")
-    next_fit_photos: int | None = Field(
-        description="number of photos from which the next vocabulary is fitted automatically; null "
-        "if none is"
-    )
-    created_at: datetime
-
-
-class DeletedMapResponse(ResponseModel):
-    success: bool
-    message: str
-    deleted_map: str
 
 
 @router.get("/maps", operation_id="list_maps", dependencies=[READ])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from typing import Annotated, Any
 from uuid import UUID
 
@@ -21,9 +22,17 @@ from services.gateway.dependencies import (
     wait_for_job,
 )
 from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
-from services.gateway.schemas import JobAcceptedResponse, SimilarityResponse
+from services.gateway.json_bodies import JsonRoute
+from services.gateway.responses import JobAcceptedResponse
 from services.gateway.similarity.execute import find_similar, query_from_job, query_from_photo
-from services.gateway.similarity.geopose import GEOPOSE, GeoPoseDep, with_geopose
+from services.gateway.similarity.geopose import (
+    GEOPOSE,
+    GeoPoseDep,
+    GeoPoseRequest,
+    GeoPoseResponse,
+    require_pose,
+    with_geopose,
+)
 from services.gateway.similarity.matches import check_matching_enabled
 from services.gateway.similarity.search_params import SearchParams, SimilarityParams
 from services.gateway.uploads.multipart import FormFile, multipart_schema
@@ -35,13 +44,29 @@ from services.gateway.uploads.query_photo import (
 )
 from shared.catalog.jobs import QUERY_TTL_SECONDS, UNFINISHED_STATES, get_job
 from shared.catalog.maps import get_map
-from shared.errors import Conflict, Gone, NotFound, Unprocessable, invalid_field_error
+from shared.errors import (
+    Conflict,
+    Gone,
+    NotFound,
+    Unavailable,
+    Unprocessable,
+    invalid_field_error,
+)
+from shared.ids import new_id
 from shared.imaging.photo_header import read_photo_header
+from shared.ingest.validation import check_photo_signature
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.wakeups import JobMessage
-from shared.storage.keys import query_preview_key
+from shared.responses.similarity import SimilarityResponse
+from shared.storage.keys import query_key, query_preview_key
 
-router = APIRouter(tags=["similarity"])
+router = APIRouter(tags=["similarity"], route_class=JsonRoute)
+
+GEOPOSE_PATH = "/geopose"
+MAX_GEOPOSE_BYTES = 8_000_000
+"""Of a request with a photo in base64, which takes a third more than the photo"""
+GEOPOSE_WAIT_SECONDS = 30.0
+"""Without `Prefer: wait=N`; its clients know no jobs"""
 
 JOB_PENDING: dict[int | str, dict[str, Any]] = {
     202: {
@@ -114,6 +139,28 @@ async def search_by_uploaded_photo(
     if job.state in UNFINISHED_STATES:
         return JobAcceptedResponse.of(job, query.map).to_http(response.headers)
     return await run_in_threadpool(_result_of, gateway, job, geopose)
+
+
+@router.post(GEOPOSE_PATH, operation_id="geopose", dependencies=[READ, ADMIT_QUERY])
+async def localise_by_geopose_protocol(
+    request: Request, gateway: GatewayDep, sent: GeoPoseRequest, query: MapQuery
+) -> GeoPoseResponse:
+    """Localise a photo as the GeoPoseProtocol of the Open AR Cloud asks for it, version 1 or 2.
+
+    The response has the pose as OGC GeoPose; 422 (`no_pose`) if there is none. 503
+    (`query_unfinished`) if it takes more than 30 s, or those of `Prefer: wait=N`.
+    """
+    job = await run_in_threadpool(_queue_geopose, gateway, query.map, sent)
+    wait = parse_prefer_wait(request) or GEOPOSE_WAIT_SECONDS
+    described = await wait_for_job(gateway, job.id, wait)
+    if described is None:
+        raise query_expired_error()
+    if described.state in UNFINISHED_STATES:
+        raise Unavailable(
+            "query_unfinished", f"The photo was not described within {wait:g} s. Send it again."
+        )
+    answer = await run_in_threadpool(_answer_of, gateway, described)
+    return GeoPoseResponse.of(sent, require_pose(answer))
 
 
 @router.get(
@@ -190,12 +237,30 @@ def _queue_query(
     return job
 
 
+def _queue_geopose(gateway: GatewayContext, map_name: str, sent: GeoPoseRequest) -> Job:
+    photo, job_id = sent.photo(), new_id()
+    check_photo_signature(photo)
+    header = read_photo_header(BytesIO(photo), gateway.settings.max_image_pixels)
+    search_params = sent.search_params(header)
+    gateway.store.put(query_key(job_id), photo)
+    with gateway.catalog.write() as session:
+        map_id = get_map(session, map_name).id
+        job = describe_query_job(job_id, map_id, "geopose", search_params, header)
+        session.add(job)
+    gateway.wakeups.send(JobMessage.of(job, map_name))
+    return job
+
+
 def _result_of(gateway: GatewayContext, job: Job, geopose: bool) -> Any:
-    """The result of a finished query job."""
+    """The result of a finished query job, as GeoPose if that is accepted."""
+    return with_geopose(_answer_of(gateway, job), query_job_search_params(job), geopose)
+
+
+def _answer_of(gateway: GatewayContext, job: Job) -> SimilarityResponse:
+    """The answer of a finished query job."""
     if job.state == JobState.SUCCEEDED:
         search_params = query_job_search_params(job)
-        answer = find_similar(gateway, query_from_job(gateway, job), search_params)
-        return with_geopose(answer, search_params, geopose)
+        return find_similar(gateway, query_from_job(gateway, job), search_params)
     if job.state == JobState.CANCELLED:
         raise Conflict("job_cancelled", f"The job {job.id} was cancelled.", job_id=str(job.id))
     error = job.error or {}

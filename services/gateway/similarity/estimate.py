@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from uuid import UUID
 
-from services.gateway.schemas import CameraPoseResponse, EstimateLevelResponse, EstimateResponse
 from shared.catalog.photos import Photo
 from shared.evaluation.places.evidence import PhotoLocation, RankedPhoto
 from shared.evaluation.places.probability import PlaceEstimate
+from shared.responses.similarity import CameraPoseResponse, EstimateLevelResponse, EstimateResponse
 from shared.search_api.protocol import SearchHit
 
 POSE_SHARES = (("radius_95_m", 0.95), ("radius_68_m", 0.68))

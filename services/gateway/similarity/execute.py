@@ -17,13 +17,7 @@ from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from services.gateway.dependencies import GatewayContext
-from services.gateway.schemas import (
-    CameraPoseResponse,
-    EstimateResponse,
-    SimilarityResponse,
-    SimilarPhotoResponse,
-    job_url,
-)
+from services.gateway.responses import job_url, photo_response
 from services.gateway.similarity.estimate import estimate_place, locate_hits, place_at_pose
 from services.gateway.similarity.matches import (
     MATCHING_IS_OFF,
@@ -45,6 +39,12 @@ from shared.evaluation.places.evidence import EVIDENCE_DEPTH, RankedPhoto
 from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import ELSEWHERE_SHARE, PlaceModel
 from shared.jobs import Job, JobState
+from shared.responses.similarity import (
+    CameraPoseResponse,
+    EstimateResponse,
+    SimilarityResponse,
+    SimilarPhotoResponse,
+)
 from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
 from shared.search_api.protocol import (
     FeatureReference,
@@ -59,6 +59,7 @@ from shared.storage.chunks import features_key
 log = logging.getLogger(__name__)
 
 WITH_PLACE = PhotoFilter(has_place=True)
+HINTED_PHOTOS = 10  # half of those that a pose is computed from: a hint may be wrong
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,28 +191,15 @@ def run_similarity_search(
     # Along coordinates, queries of another season look as if they were not in the map.
     is_labelled = bool(estimate.levels) and estimate.levels[0].radius_m is None
     is_missing = is_labelled and estimate.in_map is False
-    pose = find_pose(gateway, query, rankings.found.hits, search_params, is_missing=is_missing)
+    candidates = _pose_candidates(search, rankings, search_params)
+    pose = find_pose(gateway, query, candidates, search_params, is_missing=is_missing)
     similar = rankings.similar
     if isinstance(pose, CameraPoseResponse):
         estimate = place_at_pose(estimate, pose)
     hits = matches.rerank(similar.hits, search_params.rerank or 0)[: search_params.top_k]
-    response = SimilarityResponse.of_row(
-        similar.response,
-        query_file_id=query.photo_id,
-        query_filename=query.filename,
-        processing_time_ms=(time.perf_counter() - started) * 1000,
-        total_similar=0,
-        similar_images=[],
-        estimate=estimate,
-        matches=matches.response,
-        pose=None if isinstance(pose, str) else pose,
-        no_pose=pose if isinstance(pose, str) else None,
-        vocabulary=query.vocabulary,
-        generation_id=query.generation.id,
-        rows=RowType(query.generation.row_type),
-        degraded=bool(similar.response.missing),
-    ).with_photos(
-        SimilarPhotoResponse.of(
+    images = [
+        photo_response(
+            SimilarPhotoResponse,
             similar.photos[hit.photo_id],
             query.map.name,
             similarity_score=hit.score,
@@ -220,6 +208,23 @@ def run_similarity_search(
             pairs=matches.pairs(hit.photo_id) if search_params.explain else None,
         )
         for hit in hits
+    ]
+    response = SimilarityResponse.of_row(
+        similar.response,
+        query_file_id=query.photo_id,
+        query_filename=query.filename,
+        processing_time_ms=(time.perf_counter() - started) * 1000,
+        total_similar=len(images),
+        similar_images=images,
+        matches_without_place=sum(one.latitude is None and one.place is None for one in images),
+        estimate=estimate,
+        matches=matches.response,
+        pose=None if isinstance(pose, str) else pose,
+        no_pose=pose if isinstance(pose, str) else None,
+        vocabulary=query.vocabulary,
+        generation_id=query.generation.id,
+        rows=RowType(query.generation.row_type),
+        degraded=bool(similar.response.missing),
     )
     return response, _make_history(query, search_params, rankings.found, response)
 
@@ -325,6 +330,17 @@ def _rank_photos(search: _MapSearch, search_params: SearchParams) -> _Rankings:
     least = -1.0 if search_params.min_score is None else search_params.min_score
     similar = [hit for hit in found.hits[:depth] if hit.score >= least]
     return _Rankings(found, located, whole_map, replace(found, hits=similar))
+
+
+def _pose_candidates(
+    search: _MapSearch, rankings: _Rankings, search_params: SearchParams
+) -> list[SearchHit]:
+    """Return the photos that may show what the query shows: those of its hint come first."""
+    hits = rankings.found.hits
+    if search_params.hint is not None:
+        there = search_params.photos.model_copy(update={"near": search_params.hint})
+        hits = [*search.find(there, HINTED_PHOTOS).hits, *hits]
+    return list({hit.photo_id: hit for hit in hits}.values())
 
 
 def _match_best_photos(

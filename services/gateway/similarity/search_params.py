@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from services.gateway.dependencies import MapParams
 from shared.errors import invalid_field_error
+from shared.geometry.colmap_model import ColmapCamera
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS, parse_tags, parse_time
 from shared.search_api.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
 from shared.search_api.protocol import MAX_MATCHED_PHOTOS, Mode
@@ -215,6 +216,10 @@ class SearchParams(RankingParams):
     """
 
     photos: PhotoFilter = NO_FILTER
+    hint: Circle | None = None
+    """where the pose may be: photos there are tried first"""
+    camera: ColmapCamera | None = None
+    """that took the query"""
 
 
 class SimilarityParams(RankingParams, FilterParams):

@@ -196,7 +196,7 @@ def test_a_job_committed_after_the_deletion_is_cancelled_before_the_removal(
     def away(*_: Any) -> bool:
         raise Away
 
-    monkeypatch.setattr(delete_maps, "_purge_chunks", away)
+    monkeypatch.setattr(delete_maps, "delete_chunks", away)
     with pytest.raises(Away):
         purge_deleted_maps(catalog, store)
     assert read_job(catalog, job.id).state == JobState.CANCELLED

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import hashlib
 import math
@@ -16,7 +17,7 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 from scipy.spatial.transform import Rotation
 
-from services.gateway.schemas import CameraPoseResponse
+from services.gateway.routes import similarity
 from services.gateway.similarity.geopose import MEDIA_TYPE, geopose
 from shared.catalog.chunks import Chunk
 from shared.catalog.generations import Generation
@@ -38,7 +39,10 @@ from shared.geometry.frames import (
     geopose_rotation,
     rotation_of_vector,
 )
-from shared.matching.features import LocalFeatures
+from shared.jobs import Job
+from shared.matching.features import FULL_SIDE, LocalFeatures
+from shared.responses.similarity import CameraPoseResponse
+from shared.search_api.protocol import PoseRequest, PoseResponse
 from shared.storage.keys import query_features_key
 from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import add_reconstruction
@@ -300,6 +304,155 @@ def test_a_query_that_accepts_geopose_gets_local_features_where_there_is_a_recon
         has_features = headers and is_reconstructed
         with contextlib.nullcontext() if has_features else pytest.raises(NotFound):
             service.store.get(query_features_key(UUID(started["job_id"])))
+
+
+PRINCIPAL_POINT = np.array([332.0, 231.0])
+
+
+@pytest.fixture
+def describe_queries(service: Service, monkeypatch: pytest.MonkeyPatch) -> LocalFeatures:
+    """Describes queries while the gateway waits: as the scene seen beside the middle."""
+    features = take_query(ReconstructedScene())
+    moved = features.pixels() + PRINCIPAL_POINT - (CAMERA.width / 2, CAMERA.height / 2)
+    inside = ((moved > 0) & (moved < (CAMERA.width, CAMERA.height))).all(axis=1)
+    features = LocalFeatures(
+        CAMERA.width,
+        CAMERA.height,
+        (moved[inside] / (CAMERA.width, CAMERA.height) * FULL_SIDE).round().astype(np.uint16),
+        features.descriptors[inside],
+    )
+
+    async def describe(_gateway: object, job_id: UUID, _seconds: float) -> Job:
+        service.drain()
+        key = query_features_key(job_id)
+        service.store.delete(key)
+        put_features(service.store, features, key=key)
+        with service.catalog.read() as session:
+            return session.get_one(Job, job_id)
+
+    monkeypatch.setattr(similarity, "wait_for_job", describe)
+    return features
+
+
+def geopose_request(version: int, **changes: Any) -> dict[str, Any]:
+    """A request as clients of the Open AR Cloud send it, with changes of its camera reading."""
+    focal, (x, y) = CAMERA.focal_pixels, PRINCIPAL_POINT.tolist()
+    params = {"model": "PINHOLE", "modelParams": [focal, focal, x, y]}
+    image = {
+        "sequenceNumber": 0,
+        "imageFormat": "JPG",
+        "size": [CAMERA.width, CAMERA.height],
+        "imageBytes": base64.b64encode(photo_bytes(0)).decode(),
+        "imageOrientation": {"mirrored": False, "rotation": 0},
+    }
+    place = {"latitude": -33.9, "longitude": 18.4, "altitude": 0, "accuracy": 0, "heading": 0}
+    sent = {"timestamp": 1795822545000, "privacy": {"dataRetention": []}}
+    cameras, positions = {**sent, "sensorId": "eye"}, {**sent, "sensorId": "gps"}
+    sensors: list[dict[str, Any]] = [
+        {"id": "eye", "type": "camera"},
+        {"id": "gps", "type": "geolocation"},
+    ]
+    readings: Any
+    if version == 1:
+        sensors[0]["params"] = changes.pop("params", params)
+        readings = [{**cameras, "reading": image | changes}, {**positions, "reading": place}]
+    else:
+        readings = {
+            "cameraReadings": [{**cameras, **image, "params": params, **changes}],
+            "geolocationReadings": [{**positions, **place}],
+            "wiFiReadings": [],
+        }
+    return {
+        "id": "a request",
+        "timestamp": 1795822545000,
+        "type": "geopose",
+        "sensors": sensors,
+        "sensorReadings": readings,
+        "priorPoses": [],
+    }
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.usefixtures("describe_queries")
+def test_request_of_the_geopose_protocol_is_answered_with_the_pose_of_its_camera(
+    service: Service, scene: ReconstructedScene, ids: list[str], version: int
+) -> None:
+    """Its coarse position is on another continent: a hint is no filter."""
+    reconstruct(service, scene, ids)
+    answer = service.json("POST", "/geopose", json=geopose_request(version))
+    assert answer["id"] == "a request"
+    assert (answer["timestamp"], answer["type"]) == (1795822545000, "geopose")
+    place = ORIGIN.to_geographic(SIMILARITY.apply(CENTRE))
+    found = answer["geopose"]
+    assert found["position"] == pytest.approx(
+        {"lat": place.latitude, "lon": place.longitude, "h": place.altitude_m}, abs=0.1
+    )
+    away = distance_m(
+        place.latitude, place.longitude, found["position"]["lat"], found["position"]["lon"]
+    )
+    assert away < 0.15
+    yaw = 2 * math.degrees(math.atan2(found["quaternion"]["z"], found["quaternion"]["w"]))
+    assert yaw == pytest.approx(90 - HEADING + TURN_DEGREES, abs=0.3)
+    assert 0 < answer["accuracy"]["position"] < 0.5
+    assert 0 < answer["accuracy"]["orientation"] < 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "status", "code", "detail"),
+    [
+        ({"params": {"model": "PINHOLE", "modelParams": [500]}}, 422, "invalid_field", "4 param"),
+        ({"params": {"model": "FISHEYE", "modelParams": []}}, 422, "invalid_field", "none of"),
+        ({"size": [480, 640]}, 422, "invalid_field", "480 x 640, but the photo has"),
+        ({"imageOrientation": {"mirrored": True}}, 422, "invalid_field", "not upright"),
+        ({"imageOrientation": {"rotation": 90}}, 422, "invalid_field", "not upright"),
+        ({"imageBytes": "data:image/jpeg;base64,%"}, 422, "invalid_field", "not base64"),
+        ({"imageBytes": "AAAA"}, 415, "unsupported_photo", "not a photo"),
+    ],
+)
+@pytest.mark.parametrize("version", [1, 2])
+def test_invalid_request_of_the_geopose_protocol_is_refused_with_the_field(
+    service: Service, version: int, changes: dict[str, Any], status: int, code: str, detail: str
+) -> None:
+    service.indexed(0)
+    answer = service("POST", "/geopose", json=geopose_request(version, **changes))
+    assert detail in problem(answer, status, code)["detail"]
+
+
+def test_request_of_the_geopose_protocol_needs_a_photo_and_an_end(
+    service: Service, ids: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    empty: list[Any] = [[], [None, {"sensorId": [], "reading": {}}], {"cameraReadings": []}]
+    for readings in empty:
+        sent = geopose_request(1) | {"sensors": [None], "sensorReadings": readings}
+        answer = service("POST", "/geopose", json=sent)
+        assert "cameraReadings" in problem(answer, 422, "invalid_field")["detail"]
+    monkeypatch.setattr(similarity, "GEOPOSE_WAIT_SECONDS", 0.01)
+    answer = service("POST", "/geopose", json=geopose_request(2))
+    problem(answer, 503, "query_unfinished")
+
+
+@pytest.mark.usefixtures("describe_queries")
+def test_photos_at_the_hint_are_the_first_candidates_of_a_pose(
+    service: Service, scene: ReconstructedScene, ids: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reconstruct(service, scene, ids)
+    requests: list[PoseRequest] = []
+    estimate = service.search.estimate_pose
+
+    def record(request: PoseRequest) -> PoseResponse:
+        requests.append(request)
+        return estimate(request)
+
+    monkeypatch.setattr(service.search, "estimate_pose", record)
+    for file_id in ids:
+        fields = {"latitude": -33.9001, "longitude": 18.4} if file_id == ids[4] else {}
+        fields = fields or {"latitude": 45.0, "longitude": 7.7}
+        service.json("PATCH", f"/uploads/{file_id}", json=fields)
+    service.drain()
+    service.json("POST", "/geopose", json=geopose_request(2))
+    candidates = [str(candidate.photo_id) for candidate in requests[0].candidates]
+    assert candidates[0] == ids[4]
+    assert set(candidates) == set(ids)
 
 
 def test_geopose_turns_as_the_rotation_of_the_camera_does() -> None:

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import poselib
+import pycolmap
 import pytest
 
-from shared.geometry.cameras import Camera, focal_length_from_exif
+from shared.geometry.cameras import CAMERA_PARAMETERS, Camera, focal_length_from_exif
 
 
 def test_camera_projects_as_poselib_does() -> None:
@@ -46,10 +47,39 @@ def test_resized_photo_has_the_same_view() -> None:
         ({"size": (5000, 3333)}, None),
     ],
 )
-def test_focal_length_of_exif(exif: dict[str, Any], expected: float | None) -> None:
+def test_focal_length_is_read_from_exif(exif: dict[str, Any], expected: float | None) -> None:
     width, height = exif["size"]
     resolution, unit = exif.get("plane", (None, None))
     found = focal_length_from_exif(
         width, height, exif.get("focal_35mm"), exif.get("focal_mm"), resolution, unit
     )
     assert found == (expected if expected is None else pytest.approx(expected, rel=1e-3))
+
+
+@pytest.mark.parametrize("model", CAMERA_PARAMETERS)
+def test_camera_of_parameters_sees_as_that_of_pycolmap_does(model: str) -> None:
+    theirs = pycolmap.Camera.create_from_model_name(1, model, 420.0, 640, 480)
+    params = np.array(theirs.params)
+    params[theirs.principal_point_idxs()] += (14, -9)
+    extra = theirs.extra_params_idxs()
+    params[extra] = np.linspace(0.02, -0.03, len(extra))
+    theirs.params = params.tolist()
+    ours = Camera.of_parameters(model, params.tolist(), (640, 480))
+    pixels = np.random.default_rng(0).uniform((5, 5), (635, 475), (50, 2))
+    seen = np.array(theirs.cam_from_img(pixels)) * ours.focal_pixels + (320, 240)
+    np.testing.assert_allclose(ours.undistort(pixels), seen, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("model", "values", "problem"),
+    [
+        ("FISHEYE", [400.0, 320.0, 240.0], "none of SIMPLE_PINHOLE"),
+        ("PINHOLE", [400.0, 320.0, 240.0], "4 parameters: fx, fy, cx, cy"),
+        ("PINHOLE", [400.0, 0.0, 320.0, 240.0], "fx, fy"),
+    ],
+)
+def test_wrong_parameters_of_a_camera_are_named(
+    model: str, values: list[float], problem: str
+) -> None:
+    with pytest.raises(ValueError, match=problem):
+        Camera.of_parameters(model, values, (640, 480))

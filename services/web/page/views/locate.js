@@ -2,7 +2,7 @@
 
 import { currentMap, get } from "../api.js";
 import { announce, bar, button, field, fill, h, note, noteError } from "../dom.js";
-import { takesDrops, withoutHidden } from "../drop.js";
+import { fileChooser, takesDrops, withoutHidden } from "../drop.js";
 import { count, degrees, metres, nameOf, percent, plural } from "../format.js";
 import { shrinkPhoto } from "../shrink.js";
 import { findSimilar, readHeader as headerOf } from "./ask.js";
@@ -63,16 +63,8 @@ export async function showLocate(view, { signal }) {
 }
 
 function locateZone(map, take) {
-  const chooser = (attributes) => {
-    const input = h("input", { type: "file", multiple: true, class: "hidden", tabindex: "-1", "aria-hidden": "true", ...attributes });
-    input.addEventListener("change", () => {
-      take(Array.from(input.files, (file) => ({ file, path: file.webkitRelativePath || file.name })));
-      input.value = "";
-    });
-    return input;
-  };
-  const files = chooser({ "data-use": "locate", accept: "image/*,.gpx" });
-  const folder = chooser({ webkitdirectory: true });
+  const files = fileChooser({ "data-use": "locate", accept: "image/*,.gpx" }, take);
+  const folder = fileChooser({ webkitdirectory: true }, take);
   const zone = h("section", { class: "drop", "aria-label": "Locate a folder" },
     h("div", { class: "drop-words" },
       h("h1", {}, "Locate a folder"),

@@ -385,7 +385,7 @@ def test_a_ranking_like_that_of_its_best_photo_is_more_probable() -> None:
     assert np.mean(alike) > np.mean(unlike)
 
 
-def test_a_model_of_other_levels_is_not_used() -> None:
+def test_a_place_model_of_other_levels_is_not_used() -> None:
     model = PlaceModel(source="own_photos", scheme=PATHS)
     assert model.for_scheme(PATHS) is model
     assert model.for_scheme(PLAIN).source == "prior"
@@ -534,7 +534,7 @@ def test_the_calibration_source_is_the_prior_below_two_hundred_own_photos() -> N
     assert PlaceModel().calibration_source == "prior"
 
 
-def test_labelled_queries_refine_the_model() -> None:
+def test_labelled_queries_refine_the_place_model() -> None:
     """Half of the queries that look certain are wrong: the own photos did not say so."""
     samples = own_samples(noise=0.3)
     own = [s for s in samples if s.left_out is None][: MIN_LABELLED_QUERIES + 20]
