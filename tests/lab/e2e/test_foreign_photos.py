@@ -21,7 +21,7 @@ from lab.city.write import write_city
 from shared.evaluation.places.probability import PlaceEstimate
 from tests.conftest import REAL_PHOTOS
 
-pytestmark = pytest.mark.numerics
+pytestmark = [pytest.mark.numerics, pytest.mark.timeout(900)]  # both, on a busy machine
 
 FLOOR = "floor7"
 SHOWN = 24  # photos of each foreign set, at most
