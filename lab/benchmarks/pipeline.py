@@ -40,6 +40,7 @@ from services.cli.output import JsonOption
 from shared.catalog.maps import Map, Matching
 from shared.descriptors.backbones import normalise_features
 from shared.descriptors.extractor import Extractor
+from shared.imaging.preprocessing import Pixels
 from shared.matching.detectors import DETECTORS, Detector, Keypoints
 from shared.matching.features import MAX_KEYPOINTS, WORKING_SIDE
 from shared.search_api.client import HttpSearchClient
@@ -98,8 +99,8 @@ class FreeDetector(Detector):
         descriptors = torch.nn.functional.normalize(torch.randn(MAX_KEYPOINTS, self.dimension))
         self._found = torch.rand(MAX_KEYPOINTS, 2) * WORKING_SIDE, descriptors
 
-    def find_keypoints(self, images: torch.Tensor) -> Keypoints:
-        return [self._found] * len(images)
+    def find_keypoints(self, pixels: Pixels) -> Keypoints:
+        return [self._found] * len(pixels)
 
 
 def run_free_extractor() -> None:
@@ -111,7 +112,7 @@ def run_free_extractor() -> None:
         return rows[np.arange(len(photos)) % TEXTURES]
 
     DETECTORS["xfeat"] = f"{__name__}:FreeDetector"
-    Extractor.describe = describe  # type: ignore[method-assign]
+    Extractor.describe = describe  # type: ignore[assignment]
     sys.argv[1:] = ["extractor"]
     main()
 

@@ -19,6 +19,7 @@ from concurrent.futures import TimeoutError as TimedOut
 from concurrent.futures import wait
 from concurrent.futures.process import BrokenProcessPool
 
+import numpy as np
 from pebble import ProcessExpired, ProcessFuture, ProcessPool
 
 from services.extractor.decoder_process import decode_into_memory, limit_memory
@@ -62,7 +63,7 @@ class _Decoding:
 
     def photo(self) -> DecodedPhoto:
         photo, sizes = self.future.result()
-        arrays = [bytearray(size) for size in sizes]
+        arrays = [np.empty(size, np.uint8) for size in sizes]
         os.preadv(self._file, arrays, 0)
         decoded: DecodedPhoto = pickle.loads(photo, buffers=arrays)  # noqa: S301
         return decoded

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from shared.imaging.preprocessing import Pixels
 from shared.matching.detectors import Detector, Keypoints, load_tensors, read_package_weights
 from shared.matching.features import MAX_KEYPOINTS
 
@@ -25,6 +26,8 @@ class AlikedDetector(Detector):
         load_tensors(network, state, frozenset({"dkd.hw_grid"}))
         self._network = network.to(device)
 
-    def find_keypoints(self, images: torch.Tensor) -> Keypoints:
+    def find_keypoints(self, pixels: Pixels) -> Keypoints:
         """See `Detector.find_keypoints`."""
-        return [(found.keypoints, found.descriptors) for found in self._network(images)]
+        return [
+            (found.keypoints, found.descriptors) for found in self._network(self.to_images(pixels))
+        ]

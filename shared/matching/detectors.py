@@ -25,6 +25,7 @@ from shared.matching.features import MIN_SIDE, LocalFeatures
 Keypoints = Sequence[tuple[torch.Tensor, torch.Tensor]]
 
 MIN_CONTRAST = 1.0  # standard deviation of the samples, from 0 to 255
+STEP = 4  # of the rows and columns whose samples are looked at: all of them would take milliseconds
 
 DETECTORS = {
     "xfeat": "shared.matching.xfeat:XFeatDetector",
@@ -48,13 +49,17 @@ class Detector:
         self.model = f"{name}@{sha256[:12]}"
         self._device, self._limit = device, BatchSizeLimit(device)
 
-    def find_keypoints(self, images: torch.Tensor) -> Keypoints:
-        """Return the keypoints of each of (B, 3, H, W) RGB images from 0 to 1, best first.
+    def find_keypoints(self, pixels: Pixels) -> Keypoints:
+        """Return the keypoints of each of (B, H, W, 3) photos, best first.
 
         They are (n, 2) x and y in pixels, where the centre of the first pixel is (0, 0), and (n,
         dimension) L2-normalised descriptors.
         """
         raise NotImplementedError
+
+    def to_images(self, pixels: Pixels) -> torch.Tensor:
+        """Return (B, H, W, 3) photos as (B, 3, H, W) numbers from 0 to 1 on the device."""
+        return torch.from_numpy(pixels).to(self._device).permute(0, 3, 1, 2).float() / 255
 
     @torch.inference_mode()
     def detect(
@@ -73,30 +78,21 @@ class Detector:
             PhotoTooLargeForGpu: One photo alone exceeds the GPU's memory.
         """
         features = [LocalFeatures.empty(size, self.dimension) for size in sizes]
-        chosen = [index for index, size in enumerate(sizes) if max(size) >= MIN_SIDE]
-        batches = run_in_batches(
-            [photos[index] for index in chosen], self._find_in_pixels, self._limit, self._device
-        )
-        for places, found in batches:
-            for place, keypoints in zip(places, found, strict=True):
-                if keypoints is not None:
-                    index = chosen[place]
-                    height, width, _ = photos[index].shape
-                    points, descriptors = (part.float().cpu().numpy() for part in keypoints)
-                    features[index] = LocalFeatures.quantise(
-                        sizes[index], (width, height), points, descriptors
-                    )
-        return features
-
-    def _find_in_pixels(self, pixels: Pixels) -> Sequence[tuple[torch.Tensor, ...] | None]:
-        """Return the keypoints of each of (B, H, W, 3) photos, None for those of one colour."""
-        images = torch.from_numpy(pixels).to(self._device).permute(0, 3, 1, 2).float() / 255
-        contrast = 255 * images.std(dim=(1, 2, 3), correction=0)
-        found = self.find_keypoints(images)
-        return [
-            keypoints if enough else None
-            for keypoints, enough in zip(found, (contrast >= MIN_CONTRAST).tolist(), strict=True)
+        chosen = [
+            index
+            for index, (photo, size) in enumerate(zip(photos, sizes, strict=True))
+            if max(size) >= MIN_SIDE and photo[::STEP, ::STEP].std() >= MIN_CONTRAST
         ]
+        pixels = [photos[index] for index in chosen]
+        for places, found in run_in_batches(pixels, self.find_keypoints, self._limit, self._device):
+            for place, keypoints in zip(places, found, strict=True):
+                height, width, _ = pixels[place].shape
+                points, descriptors = (part.float().cpu().numpy() for part in keypoints)
+                index = chosen[place]
+                features[index] = LocalFeatures.quantise(
+                    sizes[index], (width, height), points, descriptors
+                )
+        return features
 
 
 @cache

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from shared.imaging.preprocessing import Pixels
 from shared.matching.detectors import Detector, Keypoints, load_tensors, read_package_weights
 from shared.matching.features import MAX_KEYPOINTS
 
@@ -23,7 +24,7 @@ class XFeatDetector(Detector):
         # Convolutions of this layout take a fifth less time on a CPU.
         self._network = network.eval().to(device=device).to(memory_format=torch.channels_last)
 
-    def find_keypoints(self, images: torch.Tensor) -> Keypoints:
+    def find_keypoints(self, pixels: Pixels) -> Keypoints:
         """See `Detector.find_keypoints`."""
-        found = self._network.detectAndCompute(images)
+        found = self._network.detectAndCompute(self.to_images(pixels))
         return [(each["keypoints"], each["descriptors"]) for each in found]
