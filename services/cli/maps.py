@@ -148,8 +148,7 @@ def update(
     `--matching on` waits until photos without local features have them; searches continue.
     """
     if auto_fit is None and matching is None and elsewhere is None:
-        options = "--auto-fit, --no-auto-fit, --matching or --elsewhere"
-        raise InvalidRequest("no_option", f"Specify {options}.")
+        raise InvalidRequest("no_option", "Specify --auto-fit, --matching or --elsewhere.")
     with connect(server, name, key) as client, progress_bar() as progress:
         updated = client.update_map(name, auto_fit=auto_fit, matching=matching, elsewhere=elsewhere)
         if matching == "on" and updated.model_change_id:

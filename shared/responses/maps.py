@@ -15,7 +15,7 @@ AUTO_FIT = (
     "whether a vocabulary is fitted automatically: at 50 photos, and whenever the map has doubled "
     "since the last fit. Importing or choosing a vocabulary sets it to false"
 )
-ELSEWHERE = "share of its queries that are from elsewhere, where a request does not say it"
+ELSEWHERE = "share of its queries that are from elsewhere, where a request has none; 0.33 at first"
 MATCHING = (
     "whether local features of its photos are computed and matched: `on`, `off`, or `auto`: until "
     "an evaluation finds that matches do not improve the answers"

@@ -132,6 +132,7 @@ MAP: dict[str, Any] = {
     "place_labels_are_automatic": False,
     "auto_fit": True,
     "matching": "auto",
+    "elsewhere": 0.33,
     "local_features": None,
     "model_change_id": None,
     "next_fit_photos": None,

@@ -65,6 +65,9 @@ async def _check_map(request: Request, name: MapNamePath) -> None:
 CHECK_MAP = Depends(_check_map)
 
 
+Share = Annotated[float, Field(gt=0, lt=1, description=ELSEWHERE)]
+
+
 class CreateMapRequest(RequestModel):
     name: str = Field(json_schema_extra={"pattern": MAP_NAME_PATTERN})
     extractor: str | None = Field(
@@ -85,9 +88,7 @@ class CreateMapRequest(RequestModel):
     )
     auto_fit: bool = Field(True, description=AUTO_FIT)
     matching: Matching = Field(Matching.AUTO, description=MATCHING)
-    elsewhere: float | None = Field(
-        None, gt=0, lt=1, description=f"{ELSEWHERE}; omitted: {ELSEWHERE_SHARE}"
-    )
+    elsewhere: Share | None = None
 
     @field_validator("name")
     @classmethod
@@ -116,9 +117,7 @@ class UpdateMapRequest(RequestModel):
         description=f"{MATCHING}. `on` starts a model change if photos have no local features yet; "
         "omitted: unchanged",
     )
-    elsewhere: float | None = Field(
-        None, gt=0, lt=1, description=f"{ELSEWHERE}; omitted: unchanged"
-    )
+    elsewhere: Share | None = None
 
 
 @router.get("/maps", operation_id="list_maps", dependencies=[READ])

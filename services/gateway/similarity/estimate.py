@@ -142,7 +142,7 @@ def _in_words(estimate: EstimateResponse) -> EstimateResponse:
         "radius_m": named.radius_m,
         "place": named.place,
         "confidence": named.probability,
-        "has_place": True,
+        "has_place": named.place is not None or named.latitude is not None,
     }
     where = _where(named)
     if answer is None:

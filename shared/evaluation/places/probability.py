@@ -267,17 +267,15 @@ class PlaceModel(BaseModel):
         """
         prior = shipped_prior()
         missing = self.elsewhere.probability(levels, elsewhere) if self.elsewhere else elsewhere
-        # Laplace's rule of succession: so many right ones in a row say no more.
-        observed = self.own_photos + self.labelled_queries
-        most = (observed + 1) / (observed + 2) if self.is_fitted else 1.0
-        missing = max(missing, 1 - most)
+        if self.is_fitted:  # Laplace's rule of succession
+            missing = max(missing, 1 / (self.own_photos + self.labelled_queries + 2))
         single = [
             1.0
             if level.is_whole_map
-            else _probability(self.levels[i] if i < len(self.levels) else prior.level, level)
+            else sigmoid(_log_odds(self.levels[i] if i < len(self.levels) else prior.level, level))
             for i, level in enumerate(levels)
         ]
-        increasing = np.minimum(most, (1 - missing) * np.maximum.accumulate(np.array(single)))
+        increasing = (1 - missing) * np.maximum.accumulate(np.array(single))
         return increasing.tolist(), missing
 
     def missing_log_odds(
@@ -424,10 +422,6 @@ def _match_probabilities(
     return matches
 
 
-def _probability(coefficients: Coefficients, level: CandidateLevel) -> float:
-    return float(sigmoid(np.array(_log_odds(coefficients, level))))
-
-
 def _log_odds(coefficients: Coefficients, level: CandidateLevel) -> float:
     design = shipped_prior().design(level.features[None])
     return float((design @ extended(coefficients, design.shape[1]))[0])
@@ -438,6 +432,6 @@ def extended(coefficients: Coefficients, count: int) -> FloatArray:
     return np.pad(np.array(coefficients), (0, count - len(coefficients)))
 
 
-def sigmoid(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def sigmoid(x: NDArray[np.float64] | float) -> NDArray[np.float64]:
     probabilities: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-np.clip(x, -30, 30)))
     return probabilities

@@ -16,7 +16,7 @@ from shared.evaluation.places.levels import FloatArray
 
 CERTAINTIES = (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.97, 0.98, 0.99, 0.995)
 """Certainties with stored thresholds; a request uses that of the next higher one."""
-MAX_ERROR_FACTOR = 3.0  # of an answer's error probability over 1 - certainty
+MAX_ERROR_FACTOR = 5.0  # of an answer's error probability over 1 - certainty
 CANDIDATES = 200  # thresholds that are tried
 
 

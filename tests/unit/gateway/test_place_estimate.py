@@ -138,7 +138,7 @@ def test_headline_levels_and_fields_of_an_estimate_agree(
     last = len(probabilities) - 1
     levels = [
         CandidateLevel(
-            place=f"level {n}" if of_labels else None,
+            place=f"level {n}" if of_labels and n <= max(0, last - 1) else None,
             latitude=None if of_labels else 45.0,
             longitude=None if of_labels else 7.0,
             radius_m=None if of_labels else 25.0 * 4**n,
@@ -165,6 +165,11 @@ def test_headline_levels_and_fields_of_an_estimate_agree(
     stated = [level.probability for level in told.levels]
     assert stated == sorted(stated)
     assert told.not_in_map_probability == pytest.approx(1 - stated[-1])
+    assert (told.radius_m is None) or told.latitude is not None, "a radius is that of a position"
+    assert told.has_place is (told.latitude is not None or told.place is not None)
+    if not told.answer_level and pose_m is None:
+        assert ("No level reaches" in told.reason) is (told.in_map is None)
+        assert ("Photos of elsewhere" in told.reason) is (told.in_map is False)
     if told.answer_level is not None:
         assert told.in_map
         assert stated[told.answer_level] >= min(certainty, 0.95) - 1e-9

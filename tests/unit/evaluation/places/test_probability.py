@@ -23,6 +23,7 @@ from shared.evaluation.places.levels import (
     FEATURES,
     MATCH_FEATURES,
     CandidateLevel,
+    FloatArray,
     LevelScheme,
     candidate_levels,
     shared_neighbours,
@@ -409,10 +410,11 @@ def town(
     rng = np.random.default_rng(seed)
     centres = rng.normal(size=(places, 16))
 
-    def photos(around: np.ndarray[Any, Any], each: int) -> np.ndarray[Any, Any]:
+    def photos(around: FloatArray, each: int) -> FloatArray:
         points = np.repeat(around, each, 0)
         points += noise * rng.normal(size=points.shape)
-        return points / np.linalg.norm(points, axis=1, keepdims=True)
+        points /= np.linalg.norm(points, axis=1, keepdims=True)
+        return points
 
     rows = photos(centres, per_place)
     scores = rows @ rows.T
