@@ -46,7 +46,7 @@ from lab.city.round_trip import plan_round_trip
 from lab.city.sessions import AUTUMN, NIGHT, SPRING, WINTER
 from lab.city.write import write_city
 from services.cli.output import JsonOption, Table
-from services.extractor.geometry.calibrate import calibrate, localise_left_out
+from services.extractor.geometry.calibrate import ComponentPhotos, calibrate, localise_left_out
 from services.extractor.geometry.evidence import fit_to_positions
 from services.extractor.geometry.mapping import PhotoToMap, map_photos, require_pycolmap
 from services.extractor.geometry.matching import match_pairs
@@ -163,16 +163,15 @@ class MappedPhotos:
         """See `localise_left_out`."""
         photos = self.components[component].photo_ids
         rows = [self.ids.index(photo) for photo in photos]
-        return localise_left_out(
+        left_out = ComponentPhotos(
             self.components[component],
             self.features,
             self.vlad.rows[rows],
             self.seconds[rows],
             [None] * len(rows),
-            self.matcher,
             alignment.similarity if alignment else None,
-            lambda _: None,
         )
+        return localise_left_out(left_out, self.matcher, lambda _: None)
 
 
 def bench(
