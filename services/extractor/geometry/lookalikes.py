@@ -7,6 +7,7 @@ alike share the repeated part alone, and miss what each has of its own (Heinly e
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,7 +101,7 @@ def _cluster(count: int, pairs: Pairs, excess: Floats) -> NDArray[np.intp]:
     return labels
 
 
-def _sums(count: int, pairs: Pairs, values: Floats) -> Floats:
+def _sums(count: int, pairs: NDArray[np.integer[Any]], values: Floats) -> Floats:
     """Return the symmetric (count, count) sums of the values of pairs."""
     sums = np.zeros((count, count))
     np.add.at(sums, tuple(pairs.T), values)

@@ -10,6 +10,7 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
@@ -245,14 +246,14 @@ def _map(
                 anew = max(anew, again, key=_registered)
             for each in anew:
                 adjust_to_positions(pycolmap, each, photos)
-            judged = [
-                misplaced_photos(_component_of(each, by_name), photos, matches, is_used)
-                for each in anew
-            ]
+            judge = partial(misplaced_photos, photos=photos, matches=matches, is_used=is_used)
+            judged = [judge(_component_of(each, by_name)) for each in anew]
             wrong = np.any([contradicts for _, contradicts in judged], axis=0)
             if cuts == MAX_CUTS or not wrong.any():
                 for each, (misplaced, _) in zip(anew, judged, strict=True):
-                    _deregister(each, misplaced)
+                    while misplaced:  # without these, others may have nothing that holds them
+                        _deregister(each, misplaced)
+                        misplaced, _ = judge(_component_of(each, by_name))
                 break
             is_used &= ~wrong
         plausible = [each for each in anew if _bent_focal_length(each) is None]

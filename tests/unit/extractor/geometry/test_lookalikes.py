@@ -60,8 +60,8 @@ class AlikeStreets:
         inside = ((pixels > 0) & (pixels < SIZE)).all(axis=1)
         shown = descriptors[found[inside]] + self.rng.normal(0, 0.05, (inside.sum(), DIMENSION))
         shown /= np.linalg.norm(shown, axis=1, keepdims=True)
-        pixels = (pixels[inside] - 0.5).astype(np.float32)
-        return LocalFeatures.quantise(SIZE, SIZE, pixels, shown.astype(np.float32))
+        places = (pixels[inside] - 0.5).astype(np.float32)
+        return LocalFeatures.quantise(SIZE, SIZE, places, shown.astype(np.float32))
 
     def reconstruct(self, folder: Path, positions: np.ndarray | None) -> list[Component]:
         photos = [
