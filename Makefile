@@ -33,7 +33,7 @@ ifneq ($(TORCH_INDEX),)
 	@echo $(TORCH_INDEX) > $(VENV)/torch-index
 	$(INSTALL) --index-url $(TORCH_INDEX) $$(grep -oE '^(torch|torchvision)==[0-9.]+' requirements.lock)
 endif
-	$(INSTALL) --constraint requirements.lock --editable '.[embedded,exif,heic,onnx,pose,tracks]'
+	$(INSTALL) --constraint requirements.lock --editable '.[embedded,heic,onnx,pose,tracks]'
 	@touch $(RUNNABLE)
 
 $(INSTALLED): $(RUNNABLE)

@@ -2,19 +2,18 @@
 
     python -m lab.demo [--places 300] [--picture docs/demo.jpg]
 
-Half of the city's queries are uploaded as labelled queries, with which the map's confidence is
-calibrated. The other half is held out and queried as a user's photos; the printed results are those
-that a user would get. They are of a generated city and are not comparable with published results.
+Half of the city's queries are uploaded as labelled queries: the printed recall is theirs, and the
+map's confidence is calibrated with them. The other half is held out and queried as a user's photos,
+for the picture. Results of a generated city are not comparable with published ones.
 """
 
 from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -49,11 +48,6 @@ class QueryOutcome:
     estimate: Estimate
     error_m: float | None
     """Distance of the estimate from the ground truth; None without an estimated location."""
-
-    @property
-    def right(self) -> bool:
-        """Whether the estimated location is within CORRECT_WITHIN_M of the ground truth."""
-        return self.error_m is not None and self.error_m <= CORRECT_WITHIN_M
 
 
 def _query_with_photo(
@@ -170,7 +164,6 @@ def main(
         write_city(plan, city, lambda count: progress.advance(bar, count))
         with connect(None, None) as client:
             outcomes = _run_demo(client, city, progress)
-        _print_outcomes(outcomes)
         if picture:
             _draw_outcomes(outcomes, city / "database", picture)
             print(f"Queries and their matches: {picture}")
@@ -198,27 +191,6 @@ def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutco
         outcomes.append(_query_with_photo(client, query, database))
         progress.advance(bar)
     return outcomes
-
-
-def _print_outcomes(outcomes: Sequence[QueryOutcome]) -> None:
-    inside = [a for a in outcomes if a.in_map]
-    outside = [a for a in outcomes if not a.in_map]
-    accepted = [a for a in outcomes if a.estimate.in_map]
-    errors = [a.error_m for a in outcomes if a.right and a.error_m is not None]
-    print(f"{len(outcomes)} held-out queries, {len(outside)} from outside the map:")
-    for label, share in (
-        ("R@1 of queries in the map", _share(a.best_is_correct for a in inside)),
-        ("precision of the accepted estimates", _share(a.right for a in accepted)),
-        ("accepted queries in the map", _share(bool(a.estimate.in_map) for a in inside)),
-        ("false accepts from outside the map", _share(bool(a.estimate.in_map) for a in outside)),
-        ("median error of the correct estimates", f"{median(errors):.1f} m" if errors else "-"),
-    ):
-        print(f"  {label:42s}{share}")
-
-
-def _share(counts: Iterable[bool]) -> str:
-    known = list(counts)
-    return f"{sum(known) / len(known):.1%}" if known else "-"
 
 
 if __name__ == "__main__":

@@ -512,12 +512,14 @@ class AsyncClient(AsyncTransport):
         rows: str | None = None,
         auto_fit: bool = True,
         matching: str | None = None,
+        elsewhere: float | None = None,
     ) -> answers.Map:
         """Create a map; `extractor` and `rows` (float32 or float16) default to the settings.
 
         With `place_labels_are_paths`, `/` separates the levels of place labels, or not; by default,
         evaluations decide that by the labels. `matching` (auto, on or off) is whether local
-        features of its photos are computed and matched.
+        features of its photos are computed and matched, `elsewhere` the share of its queries that
+        are from elsewhere (0.33).
         """
         body = drop_none(
             name=name,
@@ -526,6 +528,7 @@ class AsyncClient(AsyncTransport):
             rows=rows,
             auto_fit=None if auto_fit else False,
             matching=matching,
+            elsewhere=elsewhere,
         )
         return answers.Map(**await self._call("POST", "/maps", json=body))
 
@@ -537,6 +540,7 @@ class AsyncClient(AsyncTransport):
         rows: str | None = None,
         auto_fit: bool | None = None,
         matching: str | None = None,
+        elsewhere: float | None = None,
     ) -> answers.Map:
         """Change settings of a map; None leaves one unchanged.
 
@@ -547,12 +551,14 @@ class AsyncClient(AsyncTransport):
             auto_fit: Whether vocabularies are fitted automatically.
             matching: auto, on or off. With on, a model change (`model_change_id`) computes local
                 features that are missing.
+            elsewhere: Share of its queries that are from elsewhere, where a request names none.
         """
         body = drop_none(
             place_labels_are_paths=place_labels_are_paths,
             rows=rows,
             auto_fit=auto_fit,
             matching=matching,
+            elsewhere=elsewhere,
         )
         return answers.Map(**await self._call("PATCH", f"/maps/{quote(name, safe='')}", json=body))
 

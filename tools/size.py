@@ -9,6 +9,7 @@ and the lines that it finds are within the limits.
 from __future__ import annotations
 
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -194,4 +195,5 @@ def _shown(number: int | None) -> str:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends it without a traceback
     main(sys.argv[1:])

@@ -124,10 +124,6 @@ def _stop(
     )
 
 
-def _pause_redis(seconds: float) -> Fault:
-    return _stop(f"Redis paused {seconds} s", "Redis", seconds, Handle.pause, Handle.resume)
-
-
 def _disconnect(title: str, server: str, mode: ProxyMode) -> Fault:
     return Fault(
         title,

@@ -21,7 +21,7 @@ Intervals are those of the cluster bootstrap (`shared/evaluation/bootstrap.py`).
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import partial
@@ -34,13 +34,12 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from lab.benchmarks.report import Report, printed_report
-from lab.datasets.dataset import EvaluationSet
 from lab.datasets.open_dataset import open_evaluation_set
 from lab.evaluation.places import measure_background
 from lab.evaluation.query_clusters import cluster_queries
 from services.cli.environment import read_settings
 from services.cli.output import JsonOption, Table
-from shared.errors import Misconfigured
+from shared.errors import InvalidRequest, Misconfigured
 from shared.evaluation.bootstrap import bootstrap_intervals
 from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.evidence import (
@@ -62,7 +61,7 @@ from shared.place_paths import label_levels
 
 CERTAINTY = 0.95
 LEFT_OUT_GROUPS = 4
-FOREIGN_PHOTOS = 150  # of each other folder
+FOREIGN_PHOTOS = 150  # of each other folder, at most
 Mask = NDArray[np.bool_]
 
 
@@ -81,14 +80,20 @@ class DescribedPhotos:
     """(n,) clusters of the bootstrap"""
     scheme: LevelScheme
     radius_m: float
-    foreign: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    """(m, D) descriptors of photos of other sets, by the name of the set"""
+    foreign: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    """numbers of the photos of other sets, which are neither database photos nor queries"""
     match: MatchOwnPhoto | None = None
-    """compares photos of the set; None for estimates without matches"""
-    dataset: EvaluationSet | None = None
-    """the set, for its walks"""
+    """compares photos; None for estimates without matches"""
+    paths: Sequence[Path] = ()
     extractor: str = ""
     """of the descriptors, with a vocabulary fitted on the set"""
+
+    @property
+    def is_database(self) -> Mask:
+        """(n,) which photos are the map in the published split."""
+        in_map = ~self.is_query
+        in_map[[number for numbers in self.foreign.values() for number in numbers]] = False
+        return in_map
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,73 +153,98 @@ def bench(
     """Measure how often place estimates answer, how often they are right, and their calibration."""
     measured = evaluation_folders(folders)
     with printed_report(f"estimates at certainty {CERTAINTY}", as_json) as (report, progress):
-        for folder in measured:
-            others = [other for other in measured if other != folder]
-            measure_set(report, describe_set(folder, progress, others), splits, progress)
+        for photos in describe_sets(measured, progress):
+            measure_set(report, photos, splits, progress)
 
 
 def measure_set(report: Report, photos: DescribedPhotos, splits: int, progress: Progress) -> None:
     """Report the estimates of one evaluation set."""
-    bar = progress.add_task(photos.name, total=1 + splits + LEFT_OUT_GROUPS)
-    published = fit_and_judge(photos, ~photos.is_query, photos.is_query)
-    add_judged(report, f"{photos.name}, its queries", published)
+    bar = progress.add_task(photos.name, total=1 + splits)
+    in_map = photos.is_database
+    add_published(report, photos.name, photos)
     progress.advance(bar)
     drawn: list[Judged] = []
     refined: list[Judged] = []
     for seed in range(splits):
-        everything = np.ones(len(photos.rows), dtype=bool)
+        everything = in_map | photos.is_query
         chosen = draw(everything, int(photos.is_query.sum()), seed)
-        drawn += fit_and_judge(photos, ~chosen, chosen)
+        drawn += fit_and_judge(photos, everything & ~chosen, chosen)
         labelled = draw(photos.is_query, int(photos.is_query.sum()) // 2, seed)
         unlabelled = photos.is_query & ~labelled
-        refined += fit_and_judge(photos, ~photos.is_query, unlabelled, labelled)
+        refined += fit_and_judge(photos, in_map, unlabelled, labelled)
         progress.advance(bar)
     add_judged(report, f"{photos.name}, {splits} random splits", drawn)
     add_judged(report, f"{photos.name}, half of its queries labelled", refined)
-    left_out = []
-    for missing in left_out_labels(photos):
-        left_out += fit_and_judge(photos, ~photos.is_query & ~missing, missing)
-        progress.advance(bar)
-    if left_out:
-        add_left_out(report, f"{photos.name}, labels left out", left_out)
-    for name, rows in photos.foreign.items():
-        add_foreign(report, f"{photos.name}, photos of {name}", photos, rows)
+    add_left_out(report, photos.name, photos)
 
 
-def describe_set(folder: Path, progress: Progress, others: Sequence[Path] = ()) -> DescribedPhotos:
-    """Describe an evaluation set as a new map would be, and photos of other folders as queries."""
+def add_published(report: Report, what: str, photos: DescribedPhotos) -> list[Judged]:
+    """Report and return the estimates of the set's queries; report those of photos of elsewhere."""
+    trial = TrialMap(photos, photos.is_database)
+    model = trial.fit()
+    judged = trial.judge(model, np.flatnonzero(photos.is_query))
+    add_judged(report, f"{what}, its queries", judged)
+    for name, numbers in photos.foreign.items():
+        add_foreign(report, f"{what}, photos of {name}", trial.judge(model, numbers))
+    return judged
+
+
+def describe_sets(
+    folders: Sequence[Path],
+    progress: Progress,
+    own_vocabulary: bool = True,
+    most_of_each: int = FOREIGN_PHOTOS,
+) -> Iterator[DescribedPhotos]:
+    """Describe evaluation sets as new maps would be, with photos of the others as queries.
+
+    A set whose photos have no places is no map; its photos are those of another set all the same.
+    """
     # Decoder processes import the program, and their memory limit leaves no room for torch.
-    from lab.cli.evaluation.describers import extractor_describer
+    from lab.cli.evaluation.describers import FeatureCache, extractor_describer
     from lab.evaluation.ranking import describe_to_matrix
 
     settings = read_settings()
-    dataset = open_evaluation_set(folder)
-    photos = [*dataset.database, *dataset.queries]
-    describer = extractor_describer(
-        settings.new_map_extractor, None, dataset, settings, progress, fit=True
-    )
-    with describe_to_matrix(describer.describe, [photo.path for photo in photos]) as rows:
-        matrix = np.array(rows)
-    foreign = {}
-    for other in others:
-        paths = sorted(p for p in other.rglob("*") if p.suffix.lower() in (".jpg", ".png"))
-        shown = paths[:: max(1, len(paths) // FOREIGN_PHOTOS)]
-        with describe_to_matrix(describer.describe, shown) as rows:
-            foreign[other.name] = np.array(rows)
-    is_path = any("/" in (photo.place or "") for photo in photos)
-    return DescribedPhotos(
-        dataset.name,
-        matrix,
-        [PhotoLocation(photo.latitude, photo.longitude, photo.place) for photo in photos],
-        [photo.captured_at for photo in photos],
-        np.arange(len(photos)) >= len(dataset.database),
-        cluster_queries(photos).labels,
-        LevelScheme(labels_are_paths=is_path, radii_m=settings.level_radii_m),
-        settings.estimate_radius_m,
-        foreign=foreign,
-        dataset=dataset,
-        extractor=describer.name,
-    )
+    cache = FeatureCache(settings.new_map_extractor, settings)
+    for folder in folders:
+        try:
+            dataset = open_evaluation_set(folder)
+        except InvalidRequest as error:
+            if error.code != "no_positions":
+                raise
+            continue
+        photos = [*dataset.database, *dataset.queries]
+        paths, foreign = [photo.path for photo in photos], {}
+        for other in (each for each in folders if each != folder):
+            found = sorted(p for p in other.rglob("*") if p.suffix.lower() in (".jpg", ".png"))
+            shown = found[:: -(-len(found) // most_of_each) or 1]
+            foreign[other.name] = range(len(paths), len(paths) + len(shown))
+            paths += shown
+        spots = [PhotoLocation(photo.latitude, photo.longitude, photo.place) for photo in photos]
+        if not any(spot.is_known for spot in spots):
+            continue
+        describer = extractor_describer(
+            settings.new_map_extractor, None, dataset, settings, progress,
+            fit=own_vocabulary, extractor=cache,
+        )  # fmt: skip
+        with describe_to_matrix(describer.describe, paths) as rows:
+            matrix = np.array(rows)
+        numbers, extra = np.arange(len(paths)), len(paths) - len(photos)
+        yield DescribedPhotos(
+            folder.name,
+            matrix,
+            [*spots, *[PhotoLocation(None, None, None)] * extra],
+            [*(photo.captured_at for photo in photos), *[None] * extra],
+            (numbers >= len(dataset.database)) & (numbers < len(photos)),
+            np.concatenate([cluster_queries(photos).labels, len(photos) + numbers[:extra]]),
+            LevelScheme(
+                labels_are_paths=any("/" in (spot.place or "") for spot in spots),
+                radii_m=settings.level_radii_m,
+            ),
+            settings.estimate_radius_m,
+            foreign,
+            paths=paths,
+            extractor=describer.name if own_vocabulary else "",
+        )
 
 
 class TrialMap:
@@ -267,30 +297,36 @@ class TrialMap:
         return model.model_copy(update={"with_matches": model}) if self.photos.match else model
 
     def estimate(self, query: int, model: PlaceModel) -> PlaceEstimate | None:
-        """Estimate the place of a photo of the set; None without similar photos of known place."""
-        return self.estimate_row(self.photos.rows[query], model, query)
-
-    def estimate_row(
-        self, row: NDArray[np.float32], model: PlaceModel, query: int | None = None
-    ) -> PlaceEstimate | None:
-        """Estimate the place of a photo by its (D,) descriptor; see `estimate`."""
+        """Estimate the place of a photo; None without similar photos of known place."""
         scheme, radius_m = self.photos.scheme, self.photos.radius_m
-        return model.estimate(*self.search(row, query), scheme, CERTAINTY, radius_m)
+        return model.estimate(*self.search(query), scheme, CERTAINTY, radius_m)
 
-    def search(
-        self, row: NDArray[np.float32], query: int | None = None
-    ) -> tuple[list[RankedPhoto], list[RankedPhoto]]:
-        """Return the ranking of a (D,) descriptor, and that of the best photo in it.
+    def judge(self, model: PlaceModel, queries: Iterable[int]) -> list[Judged]:
+        """Estimate the places of photos, and compare them with the true ones."""
+        judged = []
+        for query in queries:
+            estimate = self.estimate(query, model)
+            if estimate is not None:
+                truth = self.photos.locations[query]
+                # The whole map is judged by the photos of elsewhere.
+                right = [level.is_right(truth) for level in estimate.levels[:-1]]
+                right.append(self.has_place(query))
+                judged.append(Judged(estimate, right, int(self.photos.clusters[query])))
+        return judged
 
-        Args:
-            query: Number of its photo in the set, to match it; None for a photo of another set.
-        """
-        found, scores = _rank(self._rows @ row)
+    def has_place(self, query: int) -> bool:
+        """Return whether the map has a photo of the place of a photo of the set."""
+        truth, radius_m = self.photos.locations[query], self.photos.radius_m
+        return any(is_same_place(truth, spot, radius_m) for spot in self.locations)
+
+    def search(self, query: int) -> tuple[list[RankedPhoto], list[RankedPhoto]]:
+        """Return the ranking of a photo, and that of the best photo in it."""
+        found, scores = _rank(self._rows @ self.photos.rows[query])
         ranking = [
             RankedPhoto(score, self.locations[index], index)
             for index, score in zip(found[:EVIDENCE_DEPTH].tolist(), scores.tolist(), strict=False)
         ]
-        if self.photos.match and query is not None:
+        if self.photos.match:
             ranking = attach_matches(ranking, partial(self._match, query))
         return ranking, self.own_photos.neighbours(int(found[0]))
 
@@ -298,7 +334,7 @@ class TrialMap:
         """Return the sample of a photo of the set."""
         truth = self.photos.locations[query]
         levels = candidate_levels(
-            *self.search(self.photos.rows[query], query),
+            *self.search(query),
             self.photos.scheme,
             spread,
             self.photos.radius_m,
@@ -326,16 +362,7 @@ def fit_and_judge(
     """
     trial = TrialMap(photos, in_map)
     model = trial.fit(np.flatnonzero(labelled).tolist() if labelled is not None else [])
-    judged = []
-    for query in np.flatnonzero(queries).tolist():
-        estimate = trial.estimate(query, model)
-        if estimate is not None:
-            truth = photos.locations[query]
-            # The whole map is judged by the photos of elsewhere.
-            right = [level.is_right(truth) for level in estimate.levels[:-1]]
-            right.append(any(is_same_place(truth, s, photos.radius_m) for s in trial.locations))
-            judged.append(Judged(estimate, right, int(photos.clusters[query])))
-    return judged
+    return trial.judge(model, np.flatnonzero(queries).tolist())
 
 
 def left_out_labels(photos: DescribedPhotos) -> Iterable[Mask]:
@@ -385,25 +412,22 @@ def _add_reliability(report: Report, what: str, judged: Sequence[Judged]) -> Non
     report.tables.append(table)
 
 
-def add_left_out(report: Report, what: str, judged: Sequence[Judged]) -> None:
+def add_left_out(report: Report, what: str, photos: DescribedPhotos) -> None:
     """Report the shares of photos that get an answer although their label is not in the map."""
-    most = 100 * (1 - CERTAINTY)
-    _add_shares(
-        report,
-        what,
-        Share("answered at the finest level", judged, lambda j: j.is_finest, at_most=most),
-        Share("wrong at any level", judged, lambda j: j.is_answer_right is False),
-    )
+    judged: list[Judged] = []
+    for missing in left_out_labels(photos):
+        judged += fit_and_judge(photos, photos.is_database & ~missing, missing)
+    if judged:
+        _add_shares(
+            report,
+            f"{what}, labels left out",
+            Share("answered at the finest level", judged, lambda j: j.is_finest, at_most=5),
+            Share("wrong at any level", judged, lambda j: j.is_answer_right is False),
+        )
 
 
-def add_foreign(
-    report: Report, what: str, photos: DescribedPhotos, rows: NDArray[np.float32]
-) -> None:
+def add_foreign(report: Report, what: str, judged: Sequence[Judged]) -> None:
     """Report the shares of photos of elsewhere that get an answer, and that are in the map."""
-    trial = TrialMap(photos, ~photos.is_query)
-    model = trial.fit()
-    estimates = [e for row in rows if (e := trial.estimate_row(row, model)) is not None]
-    judged = [Judged(e, [False] * len(e.levels), n) for n, e in enumerate(estimates)]
     most = 100 * (1 - CERTAINTY)
     _add_shares(
         report,

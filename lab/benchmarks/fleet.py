@@ -104,7 +104,7 @@ class ServiceProcess:
         self.environment = dict(environment)
         self.log_path = log
         self.should_run = False
-        self._command = command
+        self.command = command
         self._ready_url = ready_url
         self._ready_line = ready_line.encode()
         self._executed = executed
@@ -133,7 +133,7 @@ class ServiceProcess:
         with self.log_path.open("ab") as log:
             self._log_begin = log.tell()
             self._process = start(
-                self._command,
+                self.command,
                 env=self.environment,
                 cwd=self.log_path.parent,  # where no developer's .env lies
                 stdout=log,
@@ -183,8 +183,12 @@ class ServiceProcess:
 
     def cpu_seconds(self) -> float:
         """Return user and system time of the process and its children so far."""
+        return cpu_seconds_of(self.pid)
+
+    @property
+    def pid(self) -> int:
         assert self._process is not None, f"{self.name} was not started"
-        return cpu_seconds_of(self._process.pid)
+        return self._process.pid
 
     def log(self) -> str:
         return self.log_path.read_text(errors="replace")[-3000:]

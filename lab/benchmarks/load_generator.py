@@ -11,7 +11,7 @@ import io
 import itertools
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from http.client import HTTPConnection
 from typing import Any
@@ -104,7 +104,6 @@ def upload_all(
     clients: int,
     *,
     path: str = "/api/v1/upload",
-    on_done: Callable[[], object] = lambda: None,
 ) -> list[Any]:
     """Upload all files with `clients` threads and return the JSON responses.
 
@@ -119,7 +118,6 @@ def upload_all(
                 status, body = post_form(connection, path, form)
                 assert status < 300, body
                 answers[number] = json.loads(body)
-                on_done()
 
     with ThreadPoolExecutor(clients, thread_name_prefix="client") as pool:
         for client in [pool.submit(upload) for _ in range(clients)]:
@@ -130,9 +128,7 @@ def upload_all(
 POLL_SECONDS = 0.2
 
 
-def wait_for_jobs(
-    catalog: Catalog, seconds: float, on_left: Callable[[int], object] = lambda left: None
-) -> None:
+def wait_for_jobs(catalog: Catalog, seconds: float) -> None:
     """Wait until every stored photo is described.
 
     Raises AssertionError: a job failed, or the timeout has passed.
@@ -149,7 +145,6 @@ def wait_for_jobs(
             )
         assert not counts.get(JobState.FAILED), f"{counts[JobState.FAILED]} photos have failed"
         left = sum(counts.get(state, 0) for state in UNFINISHED_STATES)
-        on_left(left)
         if not left:
             return
         assert time.monotonic() < deadline, f"{left} photos wait after {seconds:g} s"

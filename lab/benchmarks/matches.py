@@ -11,7 +11,7 @@ nearest neighbours, or LightGlue's matches. CPU times are those of one thread.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,17 +25,15 @@ from PIL import Image, ImageOps
 from lab.benchmarks.estimates import (
     DescribedPhotos,
     Folders,
-    Judged,
-    add_judged,
-    describe_set,
+    add_left_out,
+    add_published,
+    describe_sets,
     evaluation_folders,
-    fit_and_judge,
-    left_out_labels,
 )
 from lab.benchmarks.report import Report, printed_report
-from services.cli.output import JsonOption, Table
+from services.cli.output import JsonOption
 from shared.evaluation.places.evidence import match_support
-from shared.matching.detectors import Detector, detect_features, load_detector
+from shared.matching.detectors import Detector, load_detector
 from shared.matching.features import WORKING_SIDE, LocalFeatures
 from shared.matching.lightglue import LightGlueMatcher
 from shared.matching.matchers import Matcher, MutualNearest
@@ -49,7 +47,7 @@ MAX_XFEAT_BYTES = 80_000
 class MatchedPhotos:
     """Local features of the photos of a set, and the match support of pairs, each computed once."""
 
-    def __init__(self, features: Sequence[LocalFeatures], matcher: Matcher) -> None:
+    def __init__(self, features: Callable[[int], LocalFeatures], matcher: Matcher) -> None:
         self.features = features
         self.matcher = matcher
         self.match_seconds = self.verify_seconds = 0.0
@@ -63,7 +61,7 @@ class MatchedPhotos:
     def _support(self, first: int, second: int) -> float:
         pair = first, second
         if pair not in self.supports:
-            a, b = self.features[first], self.features[second]
+            a, b = self.features(first), self.features(second)
             started = time.process_time()
             matches = self.matcher.match(a, b)
             matched = time.process_time()
@@ -90,15 +88,12 @@ def bench(
         matcher = LightGlueMatcher(detector, device)
     name = f"{loaded.model}, {'LightGlue' if lightglue else 'mutual nearest'}"
     with printed_report(f"matches of {name}", as_json) as (report, progress):
-        for folder in measured:
-            photos = describe_set(folder, progress)
-            assert photos.dataset is not None
-            paths = [p.path for p in (*photos.dataset.database, *photos.dataset.queries)]
-            bar = progress.add_task(f"{photos.name}: local features", total=len(paths))
-            features, seconds = detect_all(loaded, paths, partial(progress.advance, bar))
-            matched = MatchedPhotos(features, matcher)
+        for photos in describe_sets(measured, progress):
+            bar = progress.add_task(f"{photos.name}: local features", total=len(photos.paths))
+            features, seconds = detect_all(loaded, photos.paths, partial(progress.advance, bar))
+            matched = MatchedPhotos(features.__getitem__, matcher)
             compare(report, photos, matched)
-            add_cost(report, photos.name, matched, seconds)
+            add_cost(report, photos.name, features, matched, seconds)
 
 
 def detect_all(
@@ -106,7 +101,7 @@ def detect_all(
 ) -> tuple[list[LocalFeatures], float]:
     """Return the local features of photos, and the CPU seconds of their detection."""
     torch.set_num_threads(1)
-    features, seconds = [], 0.0
+    features, seconds = list[LocalFeatures](), 0.0
     for path in paths:
         with Image.open(path) as image:
             upright = ImageOps.exif_transpose(image).convert("RGB")
@@ -114,50 +109,36 @@ def detect_all(
         size = (round(upright.width * scale), round(upright.height * scale))
         pixels = np.array(upright.resize(size, Image.Resampling.BILINEAR, reducing_gap=2.0))
         started = time.process_time()
-        features.append(detect_features(detector, pixels, upright.size))
+        features += detector.detect([pixels], [upright.size])
         seconds += time.process_time() - started
         on_photo()
     return features, seconds
 
 
 def compare(report: Report, photos: DescribedPhotos, matched: MatchedPhotos) -> None:
-    """Report the estimates of the set's queries without and with matches."""
-    table = Table("estimates", "R@1", "answered", "at the finest level", "right", title=photos.name)
+    """Report the estimates of the set's queries, and of photos of elsewhere, without and with
+    matches."""
     for name, tried in (("without", photos), ("with", replace(photos, match=matched.match))):
-        judged = fit_and_judge(tried, ~photos.is_query, photos.is_query)
         what = f"{photos.name}, {name} matches"
-        recall = _percent(j.is_right[0] is True for j in judged)
+        judged = add_published(report, what, tried)
+        recall = 100 * float(np.mean([j.is_right[0] is True for j in judged]))
         report.add(f"{what}: right at the finest level", recall, "%")
-        add_judged(report, what, judged)
-        known = [j for j in judged if j.is_answer_right is not None]
-        table.add_row(
-            name,
-            f"{recall:.1f}",
-            f"{_percent(j.estimate.answer is not None for j in judged):.1f}",
-            f"{_percent(j.is_finest for j in judged):.1f}",
-            f"{_percent(j.is_answer_right for j in known):.1f}",
-        )
-        left_out: list[Judged] = []
-        for missing in left_out_labels(photos):
-            left_out += fit_and_judge(tried, ~photos.is_query & ~missing, missing)
-        if left_out:
-            finest = _percent(j.is_finest for j in left_out)
-            report.add(f"{what}, labels left out: at the finest level", finest, "%", at_most=5)
-    report.tables.append(table)
+        add_left_out(report, what, tried)
 
 
-def add_cost(report: Report, name: str, matched: MatchedPhotos, seconds: float) -> None:
+def add_cost(
+    report: Report,
+    name: str,
+    features: Sequence[LocalFeatures],
+    matched: MatchedPhotos,
+    seconds: float,
+) -> None:
     """Report CPU times and bytes of the photos and pairs of a set."""
-    photos, pairs = len(matched.features), max(1, len(matched.supports))
-    size = np.mean([len(features.encode()) for features in matched.features])
+    photos, pairs = len(features), max(1, len(matched.supports))
+    size = np.mean([len(each.encode()) for each in features])
     pair_ms = 1000 * (matched.match_seconds + matched.verify_seconds) / pairs
     match_ms = 1000 * matched.match_seconds / pairs
     report.add(f"{name}: CPU a photo", 1000 * seconds / photos, "ms", at_most=MAX_FEATURES_MS)
     report.add(f"{name}: bytes a photo", float(size), "B", at_most=MAX_XFEAT_BYTES)
     report.add(f"{name}: CPU a pair", pair_ms, "ms", at_most=MAX_PAIR_MS)
     report.add(f"{name}: CPU a pair, matching alone", match_ms, "ms")
-
-
-def _percent(counted: Iterable[bool | None]) -> float:
-    values = [bool(value) for value in counted]
-    return 100.0 * sum(values) / max(1, len(values))

@@ -68,7 +68,7 @@ needs."""
 
 Ranking = Sequence[tuple[UUID, float]]
 """Photos with their cosines, best first."""
-SearchMethod = Callable[[Row, int, float | None], Ranking]
+SearchMethod = Callable[[Row, int], Ranking]
 """Searches with a (dimension,) row, the number of results and the minimum score."""
 
 
@@ -79,18 +79,15 @@ class QueryCase:
     name: str
     matched: bool
     k: int
-    min_score: float | None = None
 
 
 MATCHED_CASE = QueryCase("in the map, k=10", True, 10)
 OUT_OF_MAP_CASE = QueryCase("not in the map, k=10", False, 10)
-MIN_SCORE_CASE = QueryCase("not in the map, k=10, min_score=0.3", False, 10, 0.3)
 QUERY_CASES = (
     MATCHED_CASE,
     QueryCase("in the map, k=1", True, 1),
     QueryCase("in the map, k=100", True, 100),
     OUT_OF_MAP_CASE,
-    MIN_SCORE_CASE,
 )
 
 
@@ -161,13 +158,12 @@ class BruteForce:
         pieces = [np.load(path, mmap_mode="r") for path in world.chunk_paths()]
         return cls(pieces, world.photo_ids, queries)
 
-    def best(self, query: int, k: int, min_score: float | None = None) -> Ranking:
+    def best(self, query: int, k: int) -> Ranking:
         """Return the result of query number `query`."""
         scores = self._scores[query]
-        candidates = np.flatnonzero(scores >= (-np.inf if min_score is None else min_score))
-        if len(candidates) > k:
-            kth = np.partition(scores[candidates], len(candidates) - k)[len(candidates) - k]
-            candidates = candidates[scores[candidates] >= kth]
+        k = min(k, len(scores))
+        kth = np.partition(scores, len(scores) - k)[len(scores) - k]
+        candidates = np.flatnonzero(scores >= kth)
         ranked = sorted((-float(scores[row]), self._photo_ids[row]) for row in candidates.tolist())
         return [(photo_id, -score) for score, photo_id in ranked[:k]]
 
@@ -193,8 +189,8 @@ def load_worker(world: SyntheticMap) -> tuple[SearchWorker, Snapshot]:
 def placewise_search(worker: SearchWorker, snapshot: Snapshot) -> SearchMethod:
     """Return Placewise's search on the loaded snapshot, called directly."""
 
-    def search(query: Row, k: int, min_score: float | None) -> Ranking:
-        options, findable = SearchOptions(k, min_score), snapshot.photos.findable
+    def search(query: Row, k: int) -> Ranking:
+        options, findable = SearchOptions(k), snapshot.photos.findable
         found = execute_query(snapshot, query, findable, options, worker.query_batcher)
         return [(hit.photo_id, hit.score) for hit in found.hits]
 
@@ -220,12 +216,12 @@ def rival_methods(world: SyntheticMap, folder: Path) -> dict[str, SearchMethod]:
     panorama = faiss.IndexFlatIPPanorama(world.dimension, PANORAMA_LEVELS)
     panorama.add(rows)
 
-    def numpy_search(query: Row, k: int, min_score: float | None) -> Ranking:
-        return _top_k(rows @ query, ids, k, min_score)
+    def numpy_search(query: Row, k: int) -> Ranking:
+        return _top_k(rows @ query, ids, k)
 
-    def load_all_chunks(query: Row, k: int, min_score: float | None) -> Ranking:
+    def load_all_chunks(query: Row, k: int) -> Ranking:
         scores = np.concatenate([np.dot(np.load(path), query) for path in paths])
-        return _top_k(scores, ids, k, min_score)
+        return _top_k(scores, ids, k)
 
     return {
         NUMPY: numpy_search,
@@ -236,23 +232,18 @@ def rival_methods(world: SyntheticMap, folder: Path) -> dict[str, SearchMethod]:
 
 
 def _faiss_search(index: faiss.Index, ids: Sequence[UUID]) -> SearchMethod:
-    def search(query: Row, k: int, min_score: float | None) -> Ranking:
+    def search(query: Row, k: int) -> Ranking:
         scores, rows = index.search(query[np.newaxis], min(k, len(ids)))
         found = zip(rows[0].tolist(), scores[0].tolist(), strict=True)
-        least = -np.inf if min_score is None else min_score
-        return [(ids[row], score) for row, score in found if score >= least]
+        return [(ids[row], score) for row, score in found]
 
     return search
 
 
-def _top_k(
-    scores: NDArray[np.float32], ids: Sequence[UUID], k: int, min_score: float | None
-) -> Ranking:
+def _top_k(scores: NDArray[np.float32], ids: Sequence[UUID], k: int) -> Ranking:
     """Return the top k of the scores of all rows, which are in the order of the photos."""
     k = min(k, len(scores))
     best = np.argpartition(scores, len(scores) - k)[len(scores) - k :]
-    if min_score is not None:
-        best = best[scores[best] >= min_score]
     best = best[np.argsort(-scores[best], kind="stable")]
     return [(ids[row], float(scores[row])) for row in best.tolist()]
 
@@ -285,13 +276,13 @@ def compare_methods(
             numbers = range(queries) if case.matched else range(queries, 2 * queries)
             for name, search in methods.items():
                 seconds[case.name, name] = []
-                search(rows[numbers[0]], case.k, case.min_score)  # compiles, maps
+                search(rows[numbers[0]], case.k)  # compiles, maps
             for number in numbers:
-                expected = oracle.best(number, case.k, case.min_score)
+                expected = oracle.best(number, case.k)
                 for name in draw.sample(list(methods), len(methods)):
                     time.sleep(PAUSE_SECONDS)
                     started_at = time.perf_counter()
-                    found = methods[name](rows[number], case.k, case.min_score)
+                    found = methods[name](rows[number], case.k)
                     seconds[case.name, name].append(time.perf_counter() - started_at)
                     # The others compute scores in float32.
                     tolerance = TOLERANCE if name == PLACEWISE else np.inf
@@ -371,12 +362,12 @@ def _report_targets(
             "x",
             at_most=NOISE_FACTOR,
         )
-    min_score = took[MIN_SCORE_CASE.name, PLACEWISE].median / ours.median
-    for what, value, most in (
-        (f"{MIN_SCORE_CASE.name} / in the map", min_score, NOISE_FACTOR),
-        ("memory of the index / float32 rows", index_bytes / (4 * photos * dimension), 1 / 25),
-    ):
-        report.add(f"{size}: {what}", value, "x", at_most=most if has_targets else None)
+    report.add(
+        f"{size}: memory of the index / float32 rows",
+        index_bytes / (4 * photos * dimension),
+        "x",
+        at_most=1 / 25 if has_targets else None,
+    )
 
 
 TARGET_SLOWDOWN = 5.0  # p95 of cold queries over p95 of warm ones
@@ -402,9 +393,9 @@ def measure_cold_cache(
     assert len(mappings) == len(snapshot.chunks), "a loaded chunk is on disk"
     warm, cold, cached, differ = [], [], [], 0
     for number, row in enumerate(query_rows):
-        ours(row, COLD_K, None)
+        ours(row, COLD_K)
         started_at = time.perf_counter()
-        ours(row, COLD_K, None)
+        ours(row, COLD_K)
         warm.append(time.perf_counter() - started_at)
         for memory in mappings:
             memory.madvise(mmap.MADV_DONTNEED)
@@ -413,7 +404,7 @@ def measure_cold_cache(
                 os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
         cached.append(float(np.mean(np.concatenate(list(map(_cached_pages, mappings))))))
         started_at = time.perf_counter()
-        found = ours(row, COLD_K, None)
+        found = ours(row, COLD_K)
         cold.append(time.perf_counter() - started_at)
         differ += not same_ranking(found, oracle.best(number, COLD_K))
         bar.advance(task)

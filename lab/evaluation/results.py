@@ -137,6 +137,26 @@ def compare_with_run(
 ) -> RunComparison:
     """Compare this run with an earlier one, given by its `--out` folder, query by query.
 
+    Raises as `read_comparable_run` does.
+    """
+    name, ranked = read_comparable_run(folder, evaluation_set)
+    ks = [k for k in measured.recalls.recall_all if k <= ranked.shape[1]]
+    hits = compute_hits(ranked, evaluation_set.positives)
+    differences = paired_differences(
+        measured.within[:, : len(ks)], hits_at_k(hits, ks), measured.clusters.labels
+    )
+    change = measured.hits[:, 0].astype(int) - hits[:, 0].astype(int)
+    return RunComparison(
+        other=name,
+        differences=dict(zip(ks, differences, strict=True)),
+        won=np.flatnonzero(change > 0).tolist(),
+        lost=np.flatnonzero(change < 0).tolist(),
+    )
+
+
+def read_comparable_run(folder: Path, evaluation_set: EvaluationSet) -> tuple[str, Indices]:
+    """Return the name of an earlier run, by its `--out` folder, and its predictions for the set.
+
     Raises:
         NotFound: `no_run`.
         InvalidRequest: `bad_run`.
@@ -163,18 +183,7 @@ def compare_with_run(
         raise InvalidRequest(
             "bad_run", f"{folder} has predictions for {len(ranked)} of {len(positives)} queries."
         )
-    ks = [k for k in measured.recalls.recall_all if k <= ranked.shape[1]]
-    hits = compute_hits(ranked, positives)
-    differences = paired_differences(
-        measured.within[:, : len(ks)], hits_at_k(hits, ks), measured.clusters.labels
-    )
-    change = measured.hits[:, 0].astype(int) - hits[:, 0].astype(int)
-    return RunComparison(
-        other=str(stored.get("run", {}).get("name") or folder.name),
-        differences=dict(zip(ks, differences, strict=True)),
-        won=np.flatnonzero(change > 0).tolist(),
-        lost=np.flatnonzero(change < 0).tolist(),
-    )
+    return str(stored.get("run", {}).get("name") or folder.name), ranked
 
 
 def _load_metrics(folder: Path) -> dict[str, Any]:

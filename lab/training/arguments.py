@@ -227,12 +227,12 @@ class TrainingArguments(BaseModel):
     auto_insert_metric_name: bool = False
     """Insert each metric's name before its value in the file name."""
 
-    accelerator: Literal["gpu", "cuda", "mps", "cpu", "auto"] = "gpu"
+    accelerator: Literal["gpu", "cuda", "mps", "cpu", "auto"] = "auto"
     """Training accelerator: gpu, cuda, mps, cpu or auto."""
     devices: Annotated[int | str | tuple[int, ...], BeforeValidator(_parse_literal)] = (0,)
     """Device to train on: its index as [0], or 1 for any."""
     precision: Annotated[int | str, BeforeValidator(_parse_literal)] = 32
-    """Floating-point precision: 32, 16-mixed or bf16-mixed."""
+    """Floating-point precision: 32 (on a GPU with TF32), 32-true, 16-mixed or bf16-mixed."""
     compile: bool = False
     """Compile the network with torch.compile. Sums may differ in last digits."""
 
@@ -323,9 +323,8 @@ def no_gpu_error(reason: str) -> Misconfigured:
     """Build the error of a run on a GPU that can't be used."""
     return Misconfigured(
         "no_gpu",
-        f"{reason} (--accelerator gpu is the default). Train on the CPU with --accelerator cpu, on "
-        "what the machine has with --accelerator auto, or install the driver and a CUDA build of "
-        "PyTorch.",
+        f"{reason}. Train on what the machine has with --accelerator auto, the default, or install "
+        "the driver and a CUDA build of PyTorch.",
     )
 
 

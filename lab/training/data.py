@@ -20,14 +20,12 @@ from PIL import Image
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 from torchvision import transforms as tv
-from torchvision.transforms import functional
 
 from lab.datasets.dataset import EvaluationSet, TrainingPlace, TrainingSet
 from lab.datasets.open_dataset import evaluation_set_names, open_evaluation_set, open_training_set
 from lab.training.arguments import TrainingArguments, data_root_error, suggest_name
 from lab.training.photo_decoding import decode_resized
 from shared.errors import NotFound, Unprocessable
-from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
 
 ORDER_STREAM, PHOTO_STREAM, AUGMENT_STREAM = 1, 2, 3  # keep the random streams independent
 
@@ -226,23 +224,16 @@ class PhotoTransform:
         )
         # RandAugment draws from the global generator, which the training steps also use.
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+            torch.default_generator.manual_seed(seed)  # the CPU's; manual_seed also seeds GPUs
             augmented: Image.Image = randaugment(image)
         return augmented
-
-
-def to_tensor(image: Image.Image) -> Tensor:
-    """Convert an RGB image to (3, H, W) float32, normalised with ImageNet's mean and std."""
-    pixels = functional.to_tensor(image)
-    tensor: Tensor = functional.normalize(pixels, list(IMAGENET_MEAN), list(IMAGENET_STD))
-    return tensor
 
 
 class Batch(NamedTuple):
     """Photos and place labels of one training step."""
 
     photos: Tensor
-    """(n, 3, H, W) float32; n is P x K minus the photos that cannot be decoded"""
+    """(n, H, W, 3) uint8; n is P x K minus the photos that cannot be decoded"""
     labels: Tensor
     """(n,) int64 place ids"""
     undecodable: tuple[tuple[str, str], ...] = ()
@@ -250,7 +241,7 @@ class Batch(NamedTuple):
 
 
 class PlaceDataset(Dataset[Batch]):
-    """Decodes, augments and normalises the photos of one `PlaceSample`.
+    """Decodes and augments the photos of one `PlaceSample`.
 
     A photo that cannot be decoded is listed in `Batch.undecodable`, or with `fail_on_undecodable`
     raises Unprocessable (`undecodable_photo`).
@@ -284,8 +275,8 @@ class PlaceDataset(Dataset[Batch]):
                     ) from error
                 undecodable.append((str(path), error.detail))
                 continue
-            photos.append(to_tensor(image))
-        empty = torch.empty((0, 3, *self._transform.size))
+            photos.append(torch.from_numpy(np.array(image)))
+        empty = torch.empty((0, *self._transform.size, 3), dtype=torch.uint8)
         return Batch(
             torch.stack(photos) if photos else empty,
             torch.full((len(photos),), place.place_id, dtype=torch.int64),
@@ -293,13 +284,15 @@ class PlaceDataset(Dataset[Batch]):
         )
 
 
-def _collate_batches(places: list[Batch]) -> Batch:
-    """Concatenate the photos of several places."""
+def _join(parts: list[Batch]) -> Batch:
     return Batch(
-        torch.cat([place.photos for place in places]),
-        torch.cat([place.labels for place in places]),
-        tuple(each for place in places for each in place.undecodable),
+        torch.cat([part.photos for part in parts]),
+        torch.cat([part.labels for part in parts]),
+        tuple(each for part in parts for each in part.undecodable),
     )
+
+
+PART_PLACES = 8  # of a batch, which a worker loads: the first batch is made by several
 
 
 def load_batches(
@@ -309,20 +302,26 @@ def load_batches(
     start: int = 0,
     *,
     num_workers: int,
-    pin_memory: bool,
 ) -> Iterator[Batch]:
-    """Load the epoch's batches, beginning with batch number `start`; workers read ahead."""
-    return iter(
+    """Load the epoch's batches, beginning with batch number `start`; workers read two ahead."""
+    parts_of_batch = -(-sampler.places_per_batch // PART_PLACES)
+    parts = iter(
         DataLoader(
             dataset,
-            batch_sampler=sampler.batches(epoch, start),
+            batch_sampler=(
+                batch[first : first + PART_PLACES]
+                for batch in sampler.batches(epoch, start)
+                for first in range(0, len(batch), PART_PLACES)
+            ),
             num_workers=num_workers,
-            collate_fn=_collate_batches,
-            pin_memory=pin_memory,
+            prefetch_factor=-(-2 * parts_of_batch // num_workers) if num_workers else None,
+            collate_fn=_join,
             worker_init_fn=_init_worker if num_workers else None,
             generator=torch.Generator(),  # else it would draw from the training's global generator
         )
     )
+    for batch in sampler.batches(epoch, start):
+        yield _join([next(parts) for _ in range(0, len(batch), PART_PLACES)])
 
 
 def _init_worker(worker_id: int) -> None:

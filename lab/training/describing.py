@@ -13,9 +13,11 @@ import torch
 from PIL import Image
 
 from lab.evaluation.ranking import Rows, refused_photos_error
+from shared.descriptors.backbones import normalise_pixels
 from shared.descriptors.inference import (
     BatchSizeLimit,
     PhotoTooLargeForGpu,
+    autocast,
     inference_clock,
     run_in_batches,
 )
@@ -156,8 +158,6 @@ class ModelDescriber(PhotoDescriber):
             else Preprocessing("native", 1, True, max_pixels, (480, 640), _keep_size)
         )
         self._limit = BatchSizeLimit(device)
-        self._mean = torch.tensor(IMAGENET_MEAN, device=device)[:, None, None] * 255
-        self._std = torch.tensor(IMAGENET_STD, device=device)[:, None, None] * 255
         ahead = device.type != "cpu"
         decoder = PhotoDecoder(self.preprocessing, batch_photos, max_pixels, ahead=ahead)
         super().__init__(self._describe_pixels, decoder, device)
@@ -181,10 +181,10 @@ class ModelDescriber(PhotoDescriber):
         return rows
 
     def _forward(self, pixels: Pixels) -> torch.Tensor:
-        with torch.inference_mode():
+        with torch.inference_mode(), autocast("float32", self._device):
             stacked = torch.from_numpy(np.ascontiguousarray(pixels)).to(self._device)
-            photos = stacked.permute(0, 3, 1, 2).float()
-            rows: torch.Tensor = self._model((photos - self._mean) / self._std)
+            photos = normalise_pixels(stacked, IMAGENET_MEAN, IMAGENET_STD)
+            rows: torch.Tensor = self._model(photos)
             return rows.float().cpu()
 
 

@@ -44,9 +44,11 @@ from lab.training.run_folder import (
     check_trained_arguments,
 )
 from lab.training.validation import Validator, flatten_recalls, write_predictions
+from shared.descriptors.backbones import normalise_pixels
 from shared.descriptors.vpr_models.checkpoint import STATE_DICT_PREFIX, checkpoint_state
 from shared.descriptors.vpr_models.model import VprModel
 from shared.errors import Conflict, Unprocessable
+from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
 
 MAX_BAD_PHOTO_WARNINGS = 10
 
@@ -132,6 +134,10 @@ class TrainingLoop:
         self._miner = make_miner(arguments.miner_name, arguments.miner_margin)
         self._fabric = run.fabric
         self._precision = self._fabric.strategy.precision
+        # Channels last and TF32 make convolutions faster on a GPU only.
+        on_gpu = self._fabric.device.type == "cuda"
+        self._memory_format = torch.channels_last if on_gpu else torch.contiguous_format
+        run.model.to(memory_format=self._memory_format)
         network: Any = torch.compile(run.model) if arguments.compile else run.model
         optimizer = make_optimizer(run.model.parameters(), arguments)
         self._network, self._optimizer = self._fabric.setup(network, optimizer)
@@ -199,6 +205,9 @@ class TrainingLoop:
     def _train_epoch(self, loggers: Sequence[Logger]) -> None:
         """Train the rest of the current epoch."""
         history, batches = self._run.history, self._load_batches()
+        # Set in each epoch: validation is in float32.
+        torch.backends.cudnn.allow_tf32 = is_tf32 = self._arguments.precision != "32-true"
+        torch.set_float32_matmul_precision("high" if is_tf32 else "highest")
         self._network.train()
         while True:
             started_at = time.perf_counter()
@@ -234,7 +243,6 @@ class TrainingLoop:
             epoch,
             start,
             num_workers=self._arguments.num_workers,
-            pin_memory=self._fabric.device.type == "cuda",
         )
 
     def _train_step(self, batch: Batch) -> dict[str, float]:
@@ -245,9 +253,10 @@ class TrainingLoop:
                 "None of a batch's photos can be decoded: "
                 + "; ".join(p for p, _ in batch.undecodable[:3]),
             )
-        photos, labels = self._fabric.to_device((batch.photos, batch.labels))
+        pixels, labels = self._fabric.to_device((batch.photos, batch.labels))
+        photos = normalise_pixels(pixels, IMAGENET_MEAN, IMAGENET_STD)
         # Losses exponentiate similarities, which overflows in half precision.
-        rows = self._network(photos).float()
+        rows = self._network(photos.contiguous(memory_format=self._memory_format)).float()
         mined = self._miner(rows, labels) if self._miner is not None else None
         loss = self._loss(rows, labels, mined)
         self._last_loss = float(loss.detach())

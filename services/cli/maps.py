@@ -16,6 +16,7 @@ from services.cli.output import (
     ServerOption,
     Table,
     format_pca,
+    format_percent,
     print_json,
     print_result,
     print_table,
@@ -32,6 +33,8 @@ MATCHING_HELP = (
     "Compute and match local features of its photos: on, off, or auto: until an evaluation finds "
     "that matches do not improve the answers."
 )
+
+ELSEWHERE_HELP = "Share of its queries that are from elsewhere, between 0 and 1."
 
 MapName = Annotated[str, typer.Argument(metavar="NAME")]
 
@@ -103,6 +106,9 @@ def create(
         ),
     ] = None,
     matching: Annotated[str | None, typer.Option(help=f"{MATCHING_HELP} Default: auto.")] = None,
+    elsewhere: Annotated[
+        float | None, typer.Option(help=f"{ELSEWHERE_HELP} Default: 0.33.")
+    ] = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
@@ -115,6 +121,7 @@ def create(
             place_labels_are_paths=place_labels_are_paths,
             rows=rows,
             matching=matching,
+            elsewhere=elsewhere,
         )
     print_result(created, as_json, f"Created map {name} with extractor {created.extractor}.")
 
@@ -131,23 +138,26 @@ def update(
         ),
     ] = None,
     matching: Annotated[str | None, typer.Option(help=MATCHING_HELP)] = None,
+    elsewhere: Annotated[float | None, typer.Option(help=ELSEWHERE_HELP)] = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Change automatic fits and matching of a map.
+    """Change automatic fits and matching of a map, and how many queries are from elsewhere.
 
     `--matching on` waits until photos without local features have them; searches continue.
     """
-    if auto_fit is None and matching is None:
-        raise InvalidRequest("no_option", "Specify --auto-fit, --no-auto-fit or --matching.")
+    if auto_fit is None and matching is None and elsewhere is None:
+        options = "--auto-fit, --no-auto-fit, --matching or --elsewhere"
+        raise InvalidRequest("no_option", f"Specify {options}.")
     with connect(server, name, key) as client, progress_bar() as progress:
-        updated = client.update_map(name, auto_fit=auto_fit, matching=matching)
+        updated = client.update_map(name, auto_fit=auto_fit, matching=matching, elsewhere=elsewhere)
         if matching == "on" and updated.model_change_id:
             wait_for_job(client, updated.model_change_id, progress, "local features")
             updated = next(map_ for map_ in client.maps() if map_.name == name)
     changes = [_describe_auto_fit(updated)] if auto_fit is not None else []
     changes += [f"matching {_format_features(updated)}"] if matching else []
+    changes += [f"{format_percent(updated.elsewhere)} from elsewhere"] if elsewhere else []
     print_result(updated, as_json, f"Map {name}: {'; '.join(changes)}.")
 
 

@@ -112,7 +112,7 @@ def query(
         float | None,
         typer.Option(
             help="Share of your queries that are from elsewhere than the map, between 0 and 1. "
-            "Default: 0.33.",
+            "Default: the map's.",
         ),
     ] = None,
     map_name: MapOption = None,

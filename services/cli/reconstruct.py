@@ -148,7 +148,7 @@ def _print_reconstruction(made: Reconstruction, result: Json) -> None:
         Column("photos", justify="right"),
         Column("points", justify="right"),
         Column("error", justify="right", no_wrap=True),
-        Column("found again", justify="right", no_wrap=True),
+        Column("localised", justify="right", no_wrap=True),
         "alignment",
     )
     for each in made.components:

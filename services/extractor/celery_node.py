@@ -22,10 +22,10 @@ from kombu.connection import Connection
 
 from shared.catalog.jobs import EXTRACTOR_JOBS
 from shared.config.settings import Settings
-from shared.jobs.celery_wakeups import (
+from shared.jobs.celery_messages import (
     BROKER_ERRORS,
     RETRY_SECONDS,
-    CeleryWakeups,
+    CeleryJobMessages,
     open_redis,
 )
 from shared.jobs.wakeups import WakeupQueue, task_name
@@ -50,7 +50,7 @@ class CeleryNode:
         app: Celery,
         settings: Settings,
         name: str,
-        wakeups: CeleryWakeups,
+        wakeups: CeleryJobMessages,
         read_state: Callable[[], Mapping[str, Any]],
     ) -> None:
         self._app = app

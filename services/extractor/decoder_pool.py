@@ -10,6 +10,8 @@ from __future__ import annotations
 import functools
 import logging
 import multiprocessing
+import os
+import pickle
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -17,11 +19,13 @@ from concurrent.futures import TimeoutError as TimedOut
 from concurrent.futures import wait
 from concurrent.futures.process import BrokenProcessPool
 
+import numpy as np
 from pebble import ProcessExpired, ProcessFuture, ProcessPool
 
-from services.extractor.decoder_process import limit_memory
+from services.extractor.decoder_process import decode_into_memory, limit_memory
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, Unavailable, Unprocessable
+from shared.ids import new_id
 from shared.imaging.decode import DecodedPhoto, decode_photo
 from shared.imaging.file_formats import Previews
 from shared.imaging.preprocessing import Preprocessing
@@ -41,6 +45,31 @@ DECODE_MEMORY_BYTES = 2_000_000_000  # of one process: a JPEG of 200 megapixels 
 MAX_DECODE_ATTEMPTS = 2
 
 Decode = Callable[[bytes], DecodedPhoto]
+
+
+class _Decoding:
+    """A photo that is being decoded, and the memory to which its pixels are written."""
+
+    def __init__(self, pool: ProcessPool, data: bytes, decode: Decode, timeout: float) -> None:
+        name = f"photo-{new_id()}"
+        self._file = os.memfd_create(name)
+        try:
+            self.future: ProcessFuture[tuple[bytes, list[int]]] = pool.schedule(
+                decode_into_memory, args=[decode, data, self._file, name], timeout=timeout
+            )
+        except RuntimeError as error:  # raised by pebble when the pool is not running
+            self.close()
+            raise _pool_broken_error() from error
+
+    def photo(self) -> DecodedPhoto:
+        photo, sizes = self.future.result()
+        arrays = [np.empty(size, np.uint8) for size in sizes]
+        os.preadv(self._file, arrays, 0)
+        decoded: DecodedPhoto = pickle.loads(photo, buffers=arrays)  # noqa: S301
+        return decoded
+
+    def close(self) -> None:
+        os.close(self._file)
 
 
 class DecoderPool:
@@ -85,12 +114,17 @@ class DecoderPool:
             for_detection=for_detection,
         )
         outcomes: list[DecodedPhoto | PlacewiseError] = []
-        pending: deque[tuple[ProcessFuture[DecodedPhoto], bytes]] = deque()
-        for data in photos:
-            if len(pending) == self._settings.decode_processes * SCHEDULED_PER_PROCESS:
+        pending: deque[tuple[_Decoding, bytes]] = deque()
+        try:
+            for data in photos:
+                if len(pending) == self._settings.decode_processes * SCHEDULED_PER_PROCESS:
+                    outcomes.append(self._result(*pending.popleft(), decode))
+                pending.append((self._schedule(data, decode), data))
+            while pending:
                 outcomes.append(self._result(*pending.popleft(), decode))
-            pending.append((self._schedule(data, decode), data))
-        outcomes += [self._result(future, data, decode) for future, data in pending]
+        finally:
+            for decoding, _ in pending:
+                decoding.close()
         return outcomes
 
     def close(self) -> None:
@@ -99,26 +133,25 @@ class DecoderPool:
         self._pool.join()
 
     def _start_pool(self) -> ProcessPool:
-        return ProcessPool(
+        pool = ProcessPool(
             max_workers=self._settings.decode_processes,
             # Forking is not safe in a process with torch's threads and locks.
             context=multiprocessing.get_context("spawn"),
             initializer=limit_memory,
             initargs=[self._memory_bytes],
         )
+        pool.schedule(os.getpid)  # starts the processes; else the first photo would
+        return pool
 
-    def _schedule(self, data: bytes, decode: Decode) -> ProcessFuture[DecodedPhoto]:
-        try:
-            return self._pool.schedule(decode, args=[data], timeout=self._timeout_seconds)
-        except RuntimeError as error:  # raised by pebble when the pool is not running
-            raise _pool_broken_error() from error
+    def _schedule(self, data: bytes, decode: Decode) -> _Decoding:
+        return _Decoding(self._pool, data, decode, self._timeout_seconds)
 
     def _result(
-        self, future: ProcessFuture[DecodedPhoto], data: bytes, decode: Decode
+        self, decoding: _Decoding, data: bytes, decode: Decode
     ) -> DecodedPhoto | PlacewiseError:
         for attempt in range(1, MAX_DECODE_ATTEMPTS + 1):
             try:
-                return self._await(future)
+                return self._await(decoding)
             except PlacewiseError as error:
                 if isinstance(error, Unavailable):
                     raise
@@ -135,23 +168,23 @@ class DecoderPool:
                         f"The decoder crashed on this photo {MAX_DECODE_ATTEMPTS} times "
                         f"({type(error).__name__}).",
                     )
-                future = self._schedule(data, decode)
+                decoding = self._schedule(data, decode)
         raise AssertionError("the last attempt returns")
 
-    def _await(self, future: ProcessFuture[DecodedPhoto]) -> DecodedPhoto:
-        """Wait for the future's result.
+    def _await(self, decoding: _Decoding) -> DecodedPhoto:
+        """Wait for the photo and release its memory.
 
         Raises Unavailable if the pool stopped, because no result will come then.
         """
-        while True:
-            done, _ = wait([future], timeout=POOL_POLL_SECONDS)
-            if done:
-                try:
-                    return future.result()
-                except BrokenProcessPool as error:  # a child was killed between two photos
-                    raise _pool_broken_error() from error
-            if not self._pool.active:
-                raise _pool_broken_error()
+        try:
+            while not wait([decoding.future], timeout=POOL_POLL_SECONDS).done:
+                if not self._pool.active:
+                    raise _pool_broken_error()
+            return decoding.photo()
+        except BrokenProcessPool as error:  # a child was killed between two photos
+            raise _pool_broken_error() from error
+        finally:
+            decoding.close()
 
 
 def _pool_broken_error() -> Unavailable:

@@ -1,8 +1,16 @@
-"""Initializer of decoder processes. Imports little, because photos wait for a process to start."""
+"""What runs in decoder processes. Imports little, because photos wait for a process to start.
+
+Pixels return through memory that the pool has opened, because a pipe passes 64 kB at a time and its
+reader would hold the worker's interpreter meanwhile.
+"""
 
 from __future__ import annotations
 
+import os
+import pickle
 import resource
+from collections.abc import Callable
+from pathlib import Path
 
 from PIL import Image
 
@@ -16,3 +24,32 @@ def limit_memory(limit_bytes: int) -> None:
     # Without reuse, every image's memory is mapped page by page and returned to the system, which
     # took almost half of the decoding time.
     Image.core.set_blocks_max(PILLOW_CACHED_BLOCKS)  # type: ignore[attr-defined]
+
+
+def decode_into_memory(
+    decode: Callable[[bytes], object], data: bytes, file_number: int, name: str
+) -> tuple[bytes, list[int]]:
+    """Write the arrays of the decoded photo to a file in memory.
+
+    Args:
+        decode: Decodes a photo.
+        data: The photo.
+        file_number: Number of the file in the parent process.
+        name: Name of the file: the number may be that of another file, if the parent waits no
+            longer.
+
+    Returns:
+        The pickled photo without its arrays, and the sizes of these.
+
+    Raises:
+        FileNotFoundError: The parent waits no longer.
+    """
+    buffers: list[pickle.PickleBuffer] = []
+    photo = pickle.dumps(decode(data), protocol=5, buffer_callback=buffers.append)
+    with Path(f"/proc/{os.getppid()}/fd/{file_number}").open("r+b", buffering=0) as file:
+        if str(Path(f"/proc/self/fd/{file.fileno()}").readlink()) != f"/memfd:{name} (deleted)":
+            raise FileNotFoundError(name)
+        arrays = [buffer.raw() for buffer in buffers]
+        for array in arrays:
+            file.write(array)
+    return photo, [array.nbytes for array in arrays]

@@ -8,7 +8,9 @@ same precision, they are copied. Local features that the active generation has a
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any
 from uuid import UUID
@@ -41,6 +43,7 @@ from shared.storage.keys import preview_key, query_key, query_preview_key, thumb
 
 log = logging.getLogger(__name__)
 
+READ_AHEAD = 4  # photos that are being read while others are decoded
 PREVIEWS_BY_KIND = {JobKind.INDEX: Previews.ALL, JobKind.DESCRIBE: Previews.OTHER_FORMATS}
 
 
@@ -62,6 +65,9 @@ def describe_photos(context: ExtractorContext, batch: JobBatch) -> Iterator[None
         with batch.timed("features"):
             features.detect()
     yield
+    with batch.timed("thumbnails"):
+        for stored in photos.previews:
+            stored.result()
     with batch.timed("publish"):
         publish(context, batch, target.generation, photos.ready, photos.failed, rows, features)
 
@@ -77,6 +83,8 @@ class _PreparedPhotos:
     """The pixels, or else a stored row, of each of the jobs in `ready`."""
     failed: list[tuple[Job, PlacewiseError]] = field(default_factory=list)
     """Jobs whose photo can't be described, each with the reason."""
+    previews: list[Future[None]] = field(default_factory=list)
+    """Thumbnails and previews that are being stored."""
 
     def compute_rows(self, dimension: int) -> Rows:
         """Compute a row for each job of `ready`.
@@ -118,14 +126,12 @@ def _read_photos(
     decoded, photos.failed = _decode_photos(
         context, batch, batch.jobs, target, for_detection=for_detection
     )
-    # Stored here and not with the chunk, while the model runs the previous batch.
-    with batch.timed("thumbnails"):
-        for job, photo in decoded:
-            photos.ready.append(job)
-            photos.inputs.append(photo.pixels)
-            _store_previews(context.store, job, photo)
-            if features:
-                features.add_photo(job, photo)
+    for job, photo in decoded:
+        photos.ready.append(job)
+        photos.inputs.append(photo.pixels)
+        photos.previews.append(context.transfers.submit(_store_previews, context.store, job, photo))
+        if features:
+            features.add_photo(job, photo)
     return photos
 
 
@@ -149,12 +155,16 @@ def _decode_photos(
 
     def read() -> Iterator[bytes]:
         # Read as they are decoded: a batch of the largest photos would take gigabytes.
-        for job in jobs:
-            if job.id not in keys:
-                continue
+        waiting = deque(job for job in jobs if job.id in keys)
+        reads: deque[tuple[Job, Future[bytes]]] = deque()
+        while waiting or reads:
+            while waiting and len(reads) < READ_AHEAD:
+                job = waiting.popleft()
+                reads.append((job, context.transfers.submit(context.store.get, keys[job.id])))
+            job, reading = reads.popleft()
             try:
                 with batch.timed("read"):
-                    data = context.store.get(keys[job.id])
+                    data = reading.result()
             except NotFound as error:
                 # Deleted since the catalog was read, or lost: `publish` checks under the map's
                 # lock.

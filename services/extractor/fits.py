@@ -13,6 +13,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -27,7 +28,7 @@ from services.extractor.handlers import ExtractorContext
 from services.extractor.model_changes import NewVocabulary, map_extractor, start_generation
 from services.extractor.model_registry import DescriptorPipeline, ModelRegistry
 from shared.catalog.chunks import Descriptor, find_descriptor_rows
-from shared.catalog.jobs import CHILD_PROCESS_JOBS
+from shared.catalog.jobs import FIT_WORKER_JOBS
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.tables import open_catalog
 from shared.catalog.vocabularies import VocabularyOrigin, get_pca_source_generation
@@ -186,7 +187,7 @@ class FitWorker:
         self._models = context.models
         self._compute = compute
         self._runner = JobRunner(
-            context.catalog, context.settings, name, CHILD_PROCESS_JOBS, on_outcome, wakeups
+            context.catalog, context.settings, name, FIT_WORKER_JOBS, on_outcome, wakeups
         )
 
     def run(self, stop: threading.Event) -> None:
@@ -198,11 +199,10 @@ class FitWorker:
         return self._runner.run_next(lambda job: self._run(job, stop))
 
     def _run(self, job: Job, stop: threading.Event) -> None:
-        if job.kind == JobKind.RECONSTRUCT:
-            ReconstructionJob(self.context, job, stop).run()
-            return
-        fit = self._fit_vocabulary if job.kind == JobKind.FIT else self._fit_whitening
-        fit(job, stop)
+        self.HANDLERS[job.kind](self, job, stop)
+
+    def _reconstruct(self, job: Job, stop: threading.Event) -> None:
+        ReconstructionJob(self.context, job, stop).run()
 
     def _fit_vocabulary(self, job: Job, stop: threading.Event) -> None:
         extractor = map_extractor(self.context, job)
@@ -308,3 +308,9 @@ class FitWorker:
                 progress.update(sampled + FIT_PROGRESS_UNITS * done // max(1, total), stage)
 
         return self._compute(request, self.context.settings, report, progress.check)
+
+    HANDLERS: ClassVar[dict[JobKind, Callable[[FitWorker, Job, threading.Event], None]]] = {
+        JobKind.FIT: _fit_vocabulary,
+        JobKind.PCA: _fit_whitening,
+        JobKind.RECONSTRUCT: _reconstruct,
+    }

@@ -1,7 +1,7 @@
 """Registry of the extractor's job handlers, which `worker` runs stage by stage.
 
 A handler is a generator that reads from top to bottom: prepare, describe, publish. Each `yield`
-ends a stage, because each of the three runs in another thread: batches are pipelined.
+ends a stage, and the next one runs in another thread.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import contextlib
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 from services.extractor.decoder_pool import DecoderPool
@@ -20,6 +20,8 @@ from shared.catalog.jobs import Job, JobKind
 from shared.config.settings import Settings
 from shared.jobs.runner import ClaimedJobs
 from shared.storage import ObjectStore
+
+TRANSFER_THREADS = 8  # an object of a bucket takes milliseconds, a photo in the GPU one or two
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +35,15 @@ class ExtractorContext:
     decoders: DecoderPool
     is_stopping: Callable[[], bool]
     """Whether the worker is to stop, so that a pass of a network of others is ended."""
+    transfers: ThreadPoolExecutor = field(
+        default_factory=lambda: ThreadPoolExecutor(TRANSFER_THREADS, "transfer")
+    )
+    """Threads that read photos ahead and store their previews."""
+
+    def close(self) -> None:
+        """End the decoders and threads."""
+        self.decoders.close()
+        self.transfers.shutdown()
 
 
 @dataclass(slots=True)
@@ -41,8 +52,6 @@ class JobBatch(ClaimedJobs):
 
     stages: Iterator[None] = field(default_factory=lambda: iter(()))
     """The running handler."""
-    prepared: Future[bool] = field(default_factory=Future)
-    """Whether a stage follows the preparation."""
     outcomes: Counter[str] = field(default_factory=Counter)
     """Number of jobs that succeeded, failed, were lost (taken over or cancelled) or are waiting."""
     seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))

@@ -22,7 +22,7 @@ from shared.catalog.reconstructions import Reconstruction, current_reconstructio
 from shared.errors import Misconfigured, NotFound
 from shared.imaging.decode import DecodedPhoto
 from shared.jobs import Job, JobKind
-from shared.matching.detectors import Detector, detect_features
+from shared.matching.detectors import Detector
 from shared.matching.features import LocalFeatures
 from shared.storage import ObjectStore
 from shared.storage.chunks import features_key
@@ -49,9 +49,14 @@ class BatchFeatures:
 
     def detect(self) -> None:
         """Detect the features of the photos added."""
-        for job_id, photo in self._photos.items():
-            assert photo.detection_pixels is not None, "it was decoded for its features"
-            features = detect_features(self.detector, photo.detection_pixels, photo.size)
+        if not self._photos:
+            return
+        photos = list(self._photos.values())
+        found = self.detector.detect(
+            [photo.detection_pixels for photo in photos if photo.detection_pixels is not None],
+            [photo.size for photo in photos],
+        )
+        for job_id, features in zip(self._photos, found, strict=True):
             self.encoded[job_id] = features.encode()
         self._photos.clear()
 

@@ -23,7 +23,13 @@ from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.config.settings import Settings
 from shared.descriptors.backbones import Backbone
 from shared.descriptors.extractor import Extractor, choose_device, spec_fingerprint
-from shared.descriptors.inference import PRECISIONS, BatchSizeLimit, Precision, choose_precision
+from shared.descriptors.inference import (
+    PRECISIONS,
+    BatchSizeLimit,
+    Precision,
+    choose_precision,
+    model_fits_gpu,
+)
 from shared.descriptors.pca_whitening import PcaProjection, decode_whitening
 from shared.descriptors.side_by_side import SideBySideExtractor
 from shared.descriptors.vocabulary import ClusterCentres, decode_centres
@@ -105,7 +111,8 @@ class ModelRegistry:
     def _report_load(self, name: str) -> Iterator[None]:
         """Show in `state` whether the model called `name` could be loaded in the block."""
         try:
-            yield
+            with model_fits_gpu(name):
+                yield
         except PlacewiseError as error:
             self._load_errors[name] = error
             raise

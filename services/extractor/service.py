@@ -27,7 +27,7 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.installation import open_installation_store
 from shared.catalog.processes import process_heartbeat
 from shared.config.settings import Settings
-from shared.jobs.celery_wakeups import CeleryWakeups, create_celery_app
+from shared.jobs.celery_messages import CeleryJobMessages, create_celery_app
 from shared.storage import ObjectStore
 from shared.telemetry.metrics_server import serve_metrics
 
@@ -58,13 +58,13 @@ def _run_extractor(
         signal.signal(number, lambda *_: stop.set())
     with (
         serve_metrics(settings, registry),
-        contextlib.closing(CeleryWakeups(app, settings, name)) as wakeups,
+        contextlib.closing(CeleryJobMessages(app, settings, name)) as wakeups,
         contextlib.closing(
             ExtractorWorker(catalog, store, settings, name, registry=registry, wakeups=wakeups)
         ) as worker,
         process_heartbeat(catalog, "extractor", worker.state),
     ):
-        node = CeleryNode(app, settings, name, wakeups, worker.state)
+        node = CeleryNode(app, worker.context.settings, name, wakeups, worker.state)
 
         def run_jobs(stop: threading.Event) -> None:
             worker.warm_up(stop)

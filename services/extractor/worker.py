@@ -1,18 +1,17 @@
-"""Extractor worker: drains the job table in pipelined batches, queries first.
+"""Extractor worker: drains the job table in three stages, queries first.
 
-    claim ──> read, decode ──> forward pass, aggregate ──> chunk, transaction
-              batch n + 1      batch n                      batch n - 1
+    claim, read, decode ──> forward pass, aggregate ──> chunk, transaction
+    `drain`: batch n + 1    "describe": batch n         "publish": batch n - 1
 
-Bulk batches are pipelined: while one runs on the model, the next one is read and decoded and the
-previous one is published. Each stage holds one batch: a described batch waits until the previous
-one is published. Its lease is renewed through all stages, up to the transaction.
+Each stage is a thread that holds one batch: a batch waits in its stage until the next one is free.
+Its lease is renewed through all stages, up to the transaction. An exception of a stage that is not
+a job's ends `drain`.
 
-A query that arrives while a bulk batch is described is described concurrently with it; where that
-is not possible, it goes before the next bulk batch, so that it waits for one batch at most. Its row
-is published at once, by the thread that described it.
+A query that arrives meanwhile runs through all stages in a thread of its own, "queries", or in
+that of `drain`, so that it waits for no batch.
 
 Jobs that are retried alone, to isolate the job that crashed the worker, and model changes run
-exclusively: whatever was described before is published first. Fits run beside (`fits`).
+exclusively: whatever was claimed before is published first. Fits run beside (`fits`).
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ import contextlib
 import logging
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -37,20 +36,15 @@ from services.extractor.handlers import HANDLERS, ExtractorContext, JobBatch
 from services.extractor.metrics import ExtractorMetrics
 from services.extractor.model_registry import ModelRegistry
 from shared.catalog.database.session import Catalog
-from shared.catalog.jobs import (
-    CHILD_PROCESS_JOBS,
-    EXTRACTOR_JOBS,
-    MODEL_CHANGE_JOBS,
-    JobKind,
-    WaitingFor,
-)
+from shared.catalog.jobs import DRAINED_JOBS, SINGLE_CLAIM_JOBS, WaitingFor
 from shared.catalog.processes import PROCESS_HEARTBEAT_SECONDS, list_processes
 from shared.config.settings import Settings
+from shared.descriptors.extractor import choose_device
 from shared.errors import PlacewiseError
 from shared.jobs import Job, Priority, Wakeups
 from shared.jobs.claim import fair_batch_size, mark_started
 from shared.jobs.queue_depth import PolledValue
-from shared.jobs.runner import JobRunner, job_trace_context
+from shared.jobs.runner import JobRunner
 from shared.jobs.transitions import make_waiting_jobs_claimable
 from shared.storage import ObjectStore
 from shared.telemetry.heartbeat import Heartbeat
@@ -58,7 +52,31 @@ from shared.telemetry.heartbeat import Heartbeat
 log = logging.getLogger(__name__)
 
 DONE = object()  # a handler that has ended
-QUERY_POLL_SECONDS = 0.1  # polling interval for queries while a bulk batch is described
+QUERY_POLL_SECONDS = 0.1  # polling interval for queries while there are other jobs
+
+
+class Stage:
+    """A thread that works on one batch at a time."""
+
+    def __init__(self, name: str) -> None:
+        self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
+        self._current: Future[None] | None = None
+
+    def start(self, work: Callable[[JobBatch], None], batch: JobBatch) -> None:
+        """Hand the batch and its lease to the thread; raise what its previous `work` raised."""
+        self.wait()
+        handed_over = replace(batch, lease=batch.lease.pop_all())
+        self._current = self._executor.submit(work, handed_over)
+
+    def wait(self) -> None:
+        """Wait until the thread is free; raise what its `work` raised."""
+        current, self._current = self._current, None
+        if current is not None:
+            current.result()
+
+    def close(self) -> None:
+        """Wait for the thread and end it."""
+        self._executor.shutdown()
 
 
 class ExtractorWorker:
@@ -85,6 +103,7 @@ class ExtractorWorker:
         As the `only_worker`, so that none can be of another release, it reindexes outdated
         generations.
         """
+        settings = settings.for_device(choose_device(settings.device).type)
         self._metrics = ExtractorMetrics(registry or CollectorRegistry())
         self._heartbeat = Heartbeat(settings.heartbeat_file)
         self._only_worker = only_worker
@@ -100,13 +119,10 @@ class ExtractorWorker:
         )
         on_outcome = self._metrics.count_step_outcome
         self.fits = FitWorker(self.context, name, on_outcome, compute_fit, wakeups)
-        drained = [kind for kind in EXTRACTOR_JOBS if kind not in CHILD_PROCESS_JOBS]
-        self._runner = JobRunner(catalog, settings, name, drained, on_outcome, wakeups)
-        # Two threads, so that a query's photo does not wait for the photos of the next batch.
-        self._prepare_executor = ThreadPoolExecutor(max_workers=2, thread_name_prefix="prepare")
-        self._query_executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="queries")
-        self._publish_executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="publish")
-        self._pending_publish: Future[None] | None = None
+        self._runner = JobRunner(catalog, settings, name, DRAINED_JOBS, on_outcome, wakeups)
+        self._describing, self._publishing = Stage("describe"), Stage("publish")
+        self._queries = ThreadPoolExecutor(max_workers=1, thread_name_prefix="queries")
+        self._query_lock = threading.Lock()  # held while a query, or an exclusive job, runs
         self._extractors = PolledValue(
             (lambda: 1) if only_worker else self._count_extractors, PROCESS_HEARTBEAT_SECONDS
         )
@@ -142,46 +158,40 @@ class ExtractorWorker:
 
     def close(self) -> None:
         """Stop the threads and decoders; claimed jobs are requeued when their lease expires."""
-        self._query_executor.shutdown(wait=True)
-        self._publish_executor.shutdown(wait=True)
-        self._prepare_executor.shutdown(wait=True, cancel_futures=True)
-        self.context.decoders.close()
+        for stage in (self._describing, self._publishing):
+            stage.close()
+        self._queries.shutdown()
+        self.context.close()
 
     def drain(self, stop: threading.Event) -> bool:
         """Process jobs until none is claimable, or `stop` is set; return whether there was one."""
         self._stop = stop
-        current, upcoming = None, self._claim()
-        if upcoming is None:
+        batch = self._claim()
+        if batch is None:
             return False
-        with self._metrics.measure_drain():
+        with self._metrics.measure_drain(), self._answering_queries():
             try:
-                while upcoming is not None:
-                    if stop.is_set():
-                        with upcoming.lease:
-                            self._runner.requeue(upcoming)
-                        break
-                    current = upcoming
-                    # Claimed before the forward pass, so that its photos are decoded meanwhile.
-                    upcoming = self._claim()
-                    if not _is_query(current):
-                        # Otherwise the query would wait for this batch and the one being published.
-                        while upcoming is not None and _is_query(upcoming) and not stop.is_set():
-                            self._process(upcoming, stop)
-                            upcoming = self._claim()
-                    self._process(current, stop)
-                    if upcoming is None:
-                        self._wait_for_publish()  # which may requeue jobs
-                        upcoming = self._claim()
+                while batch is not None:
+                    # Without the catalog, claimed jobs are requeued when their lease expires.
+                    with batch.lease:
+                        self._process(batch)
+                    batch = self._claim_unless_stopping()
+                    if batch is None:
+                        self._wait_for_stages()  # which may requeue jobs
+                        batch = self._claim_unless_stopping()
             finally:
-                # Without the catalog, claimed jobs are requeued when their lease expires.
-                for unfinished in (current, upcoming):
-                    if unfinished is not None:
-                        unfinished.lease.close()
-                self._wait_for_publish()
+                self._wait_for_stages()
         return True
 
+    def _claim_unless_stopping(self) -> JobBatch | None:
+        return None if self._stop.is_set() else self._claim()
+
+    def _wait_for_stages(self) -> None:
+        self._describing.wait()
+        self._publishing.wait()
+
     def _claim(self, min_priority: int | None = None, *, alone: bool = True) -> JobBatch | None:
-        """Claim the next batch and begin to prepare it."""
+        """Claim the next batch."""
         self._heartbeat.beat()  # for each batch: a drain may last for several
         claimed = self._runner.claim(
             self._fair_batch_size(), min_priority, alone=alone, started=False
@@ -191,7 +201,6 @@ class ExtractorWorker:
         self._metrics.observe_claim(claimed.kind, len(claimed.jobs))
         batch = JobBatch(claimed.jobs, claimed.lease)
         batch.stages = HANDLERS[batch.kind](self.context, batch)
-        batch.prepared = self._prepare_executor.submit(self._prepare, batch)
         return batch
 
     def _fair_batch_size(self) -> int:
@@ -204,91 +213,84 @@ class ExtractorWorker:
             found = list_processes(session)
         return sum(process.role == "extractor" and process.is_live for process in found)
 
-    def _prepare(self, batch: JobBatch) -> bool:
-        with job_trace_context(batch.jobs, "prepare"):
-            return next(batch.stages, DONE) is not DONE
-
-    def _process(self, batch: JobBatch, stop: threading.Event) -> None:
-        """Describe and publish a batch, beside as little else as it allows."""
+    def _process(self, batch: JobBatch) -> None:
+        """Decode a batch and hand it on, or run all of its stages here."""
         if _runs_exclusively(batch):
-            self._wait_for_publish()
-            self._run(batch)
+            self._wait_for_stages()
+            with self._query_lock:
+                self._run(batch, concurrent_jobs=0)
         elif _is_query(batch):
-            self._run(batch, 0 if self._pending_publish is None else 1)
-        else:
-            with self._answering_queries(stop):
-                self._run(batch, 1, publish_later=True)
+            self._run(batch)
+        elif self._run_stage(batch, "prepare"):
+            self._describing.wait()
+            if self._stop.is_set():
+                self._runner.requeue(batch)
+            else:
+                self._describing.start(self._describe_and_hand_on, batch)
 
-    def _run(
-        self,
-        batch: JobBatch,
-        concurrent_jobs: int = 0,
-        *,
-        publish_later: bool = False,
-    ) -> None:
-        """Describe and publish a batch.
-
-        `concurrent_jobs` other jobs are in progress at the same time, any of which may be the cause
-        of a crash. With `publish_later`, the batch is published while the model runs the next one.
-        """
+    def _describe_and_hand_on(self, batch: JobBatch) -> None:
         with batch.lease:
-            if not self._describe(batch, concurrent_jobs):
-                return
-            if not publish_later:
-                self._publish(batch)
-                return
-            self._wait_for_publish()
-            described = replace(batch, lease=batch.lease.pop_all())
-            self._pending_publish = self._publish_executor.submit(self._publish, described)
-
-    def _describe(self, batch: JobBatch, concurrent_jobs: int) -> bool:
-        """Run the stage of the batch that needs the model; return whether one follows."""
-        with self._runner.step(batch, "describe"):
-            if batch.prepared.result():
-                # From here on a crash may be caused by a photo: decoding ran in other processes.
-                with self.context.catalog.write() as session:
-                    mark_started(session, batch.token, len(batch.jobs) + concurrent_jobs)
-                self._runner.report_started(batch)
-                if next(batch.stages, DONE) is not DONE:
-                    return True
-        self._record(batch)
-        return False
+            if self._describe(batch):
+                self._publishing.start(self._publish, batch)
 
     def _publish(self, batch: JobBatch) -> None:
-        with batch.lease, self._runner.step(batch, "publish"):
-            next(batch.stages, DONE)
-        self._record(batch)
+        with batch.lease:
+            self._run_stage(batch, "publish")
 
-    def _record(self, batch: JobBatch) -> None:
+    def _run(self, batch: JobBatch, concurrent_jobs: int = 1) -> None:
+        """Run all stages of a batch in this thread."""
+        with batch.lease:
+            if self._run_stage(batch, "prepare") and self._describe(batch, concurrent_jobs):
+                self._run_stage(batch, "publish")
+
+    def _describe(self, batch: JobBatch, concurrent_jobs: int = 1) -> bool:
+        """Run the stage of the batch that needs the model; return whether one follows.
+
+        `concurrent_jobs` other jobs are in progress at the same time, any of which may be the cause
+        of a crash.
+        """
+
+        def mark_jobs() -> None:
+            # From here on a crash may be caused by a photo: decoding ran in other processes.
+            with self.context.catalog.write() as session:
+                mark_started(session, batch.token, len(batch.jobs) + concurrent_jobs)
+            self._runner.report_started(batch)
+
+        return self._run_stage(batch, "describe", mark_jobs)
+
+    def _run_stage(
+        self, batch: JobBatch, name: str, begin: Callable[[], None] = lambda: None
+    ) -> bool:
+        """Run the batch's next stage; return whether one follows."""
+        with self._runner.step(batch, name):
+            begin()
+            if next(batch.stages, DONE) is not DONE:
+                return True
         self._metrics.observe_batch(batch)
         self._runner.report_ended(batch)
+        return False
 
     @contextlib.contextmanager
-    def _answering_queries(self, stop: threading.Event) -> Iterator[None]:
-        """Describe queries in another thread while the block describes a bulk batch."""
+    def _answering_queries(self) -> Iterator[None]:
+        """Answer queries in a thread of their own while the block runs."""
         done = threading.Event()
-        queries = self._query_executor.submit(self._poll_queries, done, stop)
+        answered = self._queries.submit(self._answer_queries, done)
         try:
             yield
         finally:
             done.set()
-            wait([queries])
-        queries.result()
+            answered.result()
 
-    def _poll_queries(self, done: threading.Event, stop: threading.Event) -> None:
-        while not (done.is_set() or stop.is_set()):
+    def _answer_queries(self, done: threading.Event) -> None:
+        while not (done.is_set() or self._stop.is_set()):
             query = None
-            if self._runner.has_jobs(Priority.QUERY, alone=False):
-                query = self._claim(Priority.QUERY, alone=False)
+            with self._query_lock:
+                if self._runner.has_jobs(Priority.QUERY, alone=False):
+                    query = self._claim(Priority.QUERY, alone=False)
+                if query is not None:
+                    self._run(query)
             if query is None:
                 done.wait(QUERY_POLL_SECONDS)
-            else:
-                self._run(query, 1)
-
-    def _wait_for_publish(self) -> None:
-        pending, self._pending_publish = self._pending_publish, None
-        if pending is not None:
-            pending.result()
 
 
 def _is_query(batch: JobBatch) -> bool:
@@ -297,4 +299,4 @@ def _is_query(batch: JobBatch) -> bool:
 
 def _runs_exclusively(batch: JobBatch) -> bool:
     """Whether nothing may run concurrently, so that a crash can be attributed to the job."""
-    return batch.jobs[0].alone or batch.kind in (JobKind.ADD_MODEL, *MODEL_CHANGE_JOBS)
+    return batch.jobs[0].alone or batch.kind in SINGLE_CLAIM_JOBS

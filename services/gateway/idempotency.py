@@ -35,7 +35,7 @@ from starlette.concurrency import run_in_threadpool
 
 from services.gateway.authentication import get_caller
 from services.gateway.dependencies import GatewayContext, GatewayDep, get_map_name
-from services.gateway.schemas import JobAcceptedResponse
+from services.gateway.responses import JobAcceptedResponse
 from shared.catalog.idempotency import (
     RequestIdentity,
     StoredResponse,

@@ -18,7 +18,7 @@ from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.processes import process_heartbeat
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
-from shared.jobs.celery_wakeups import CeleryWakeups, create_celery_app
+from shared.jobs.celery_messages import CeleryJobMessages, create_celery_app
 from shared.search_api.client import HttpSearchClient
 from shared.security.api_keys import hash_api_key
 from shared.telemetry.metrics_server import serve_metrics
@@ -34,7 +34,7 @@ def serve_gateway(settings: Settings, announce: Announce) -> None:
         service_process(settings, "gateway") as catalog,
         process_heartbeat(catalog, "gateway"),
         listen(settings.host, settings.port) as listener,
-        contextlib.closing(CeleryWakeups(create_celery_app(settings), settings)) as wakeups,
+        contextlib.closing(CeleryJobMessages(create_celery_app(settings), settings)) as wakeups,
         HttpSearchClient.from_settings(settings) as search,
     ):
         url = reachable_url(*listener.getsockname()[:2])

@@ -20,6 +20,7 @@ from starlette.middleware.gzip import GZipMiddleware
 
 from services.gateway.routes.health import ServiceResponse, service_info
 from services.web import HTML_FOLDER, PAGE_FOLDER
+from shared.catalog.jobs import STATUS_PAGE_JOBS
 from shared.config.settings import Settings
 
 # Browsers cache, but revalidate each time: a 304 is small, and a new release is visible at once.
@@ -86,7 +87,7 @@ def add_web_page(app: FastAPI, settings: Settings, lan_url: str | None = None) -
         return Response(image.getvalue(), media_type="image/svg+xml")
 
     @app.api_route(ASSET_PREFIX + "settings.json", methods=["GET", "HEAD"], include_in_schema=False)
-    def page_settings() -> dict[str, str | int | None]:
+    def page_settings() -> dict[str, Any]:
         return _page_settings(settings, lan_url)
 
     for folder, package in VENDORED_PACKAGES.items():
@@ -95,13 +96,14 @@ def add_web_page(app: FastAPI, settings: Settings, lan_url: str | None = None) -
     app.mount(ASSET_PREFIX, GZipMiddleware(_Assets(directory=PAGE_FOLDER)))
 
 
-def _page_settings(settings: Settings, lan_url: str | None) -> dict[str, str | int | None]:
+def _page_settings(settings: Settings, lan_url: str | None) -> dict[str, Any]:
     """Settings of the page. Served without a key: must not expose stored data."""
     return {
         "map_tiles": settings.map_tiles,
         "map_attribution": settings.tile_attribution,
         "max_file_size": settings.max_file_size,
         "lan_url": lan_url,
+        "job_kinds": STATUS_PAGE_JOBS,
     }
 
 

@@ -41,11 +41,9 @@ NO_SCORES = np.empty(0)
 
 @dataclass(frozen=True, slots=True)
 class SearchOptions:
-    """Number of results, minimum score and strategy of a search."""
+    """Number of results and strategy of a search."""
 
     k: int
-    min_score: float | None = None
-    """Minimum cosine."""
     mode: Mode = Mode.AUTO
 
 
@@ -73,7 +71,7 @@ def execute_query(
         snapshot: The snapshot.
         query: (dimension,) row of any length; a row of zeros has no similar rows.
         row_mask: (n,) bool, the rows that may be returned.
-        options: Number of results, minimum score and strategy.
+        options: Number of results and strategy.
         batcher: Batches the first-level scans of concurrent queries.
     """
     search = _Query(snapshot, query, row_mask, options, batcher)
@@ -117,9 +115,6 @@ class _Query:
     def rank_photos(self, scored: _ScoredRows) -> list[SearchHit]:
         """Return the hits, sorted by descending score, ties by photo id."""
         options, rows, scores = self.options, scored.rows, _round_scores(scored.scores)
-        if options.min_score is not None:
-            passing = scores >= options.min_score
-            rows, scores = rows[passing], scores[passing]
         if len(rows) > options.k:
             kth = np.partition(scores, len(scores) - options.k)[len(scores) - options.k]
             best = scores >= kth
@@ -155,9 +150,7 @@ class _Query:
         blocks = self.snapshot.sign_code_blocks
         coded = SignCodedQuery.of(self.vector, get_rotation(len(self.vector)))
         first = self.batcher.scan(blocks, coded, self.row_mask)
-        search = SignCodeSearch(
-            blocks, coded, options.k, options.min_score, self.snapshot.prefetch_rows
-        )
+        search = SignCodeSearch(blocks, coded, options.k, self.snapshot.prefetch_rows)
         result = search.search(first)
         if result.max_z > MAX_Z:
             return None

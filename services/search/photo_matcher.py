@@ -20,12 +20,12 @@ from shared.errors import NotFound
 from shared.matching.features import MIN_SIDE, LocalFeatures
 from shared.matching.matchers import MutualNearest
 from shared.matching.verification import verify_matches
+from shared.responses.similarity import PointPair
 from shared.search_api.protocol import (
     FeatureReference,
     MatchRequest,
     MatchResponse,
     PhotoMatches,
-    PointPair,
 )
 from shared.storage import ObjectStore
 from shared.storage.feature_files import FeatureIndex, read_feature_index

@@ -214,7 +214,7 @@ def compile_kernels() -> None:
     add_hamming_distances(
         blocks.level_addresses[0], blocks.first_rows, no_rows, query.bits, no_rows
     )
-    SignCodeSearch(blocks, query, 1, None, lambda _: None).search(first)
+    SignCodeSearch(blocks, query, 1, lambda _: None).search(first)
 
 
 def hamming_deviation(bits: int, padded: int) -> float:
@@ -234,14 +234,13 @@ class SignCodeSearch:
         blocks: SignCodeBlocks,
         query: SignCodedQuery,
         k: int,
-        min_score: float | None,
         prefetch: Callable[[Indices], None],
     ) -> None:
         """Create a search; `prefetch` is called with rows before they are compared exactly."""
         self._blocks = blocks
         self._query = query
         self._k = k
-        self._floor = -math.inf if min_score is None else min_score  # score a row has to reach
+        self._floor = -math.inf  # score a row has to reach
         self._prefetch = prefetch
         self._padded = get_rotation(blocks.dimension).padded
         self._level_ends = level_ends(self._padded)

@@ -255,7 +255,7 @@ class SearchWorker:
             background = self._query_rows.read_background(request.background)
             query = subtract_background(query, background)
         row_mask = build_row_mask(snapshot.photos, request.photos, request.exclude)
-        options = SearchOptions(request.k, request.min_score, request.mode)
+        options = SearchOptions(request.k, request.mode)
         return execute_query(snapshot, query, row_mask, options, self.query_batcher)
 
     def match(self, request: MatchRequest) -> MatchResponse:

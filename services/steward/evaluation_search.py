@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from uuid import UUID
@@ -142,8 +142,6 @@ WITH_PLACE = PhotoFilter(has_place=True)
 UNKNOWN_LOCATION = PhotoLocation(None, None, None)
 
 LocatedRanking = list[tuple[SearchHit, PhotoLocation]]
-RankPhoto = Callable[[GeotaggedPhoto, int], LocatedRanking | None]
-"""The type of `EvaluationSearch.rank_similar`."""
 
 
 @dataclass(frozen=True, slots=True)

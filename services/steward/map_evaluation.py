@@ -275,7 +275,9 @@ class MapEvaluation:
         with_matches, uses_matches = self._evaluate_matches(own_photos, samples, to_fit, scores)
         if with_matches is not None:
             of_matches = self._leave_one_out(
-                self._draw_to_match(sample), own_photos, self._order_by_matches
+                _draw(sample, MAX_MATCHED_SAMPLE, seed=len(sample)),
+                own_photos,
+                self._order_by_matches,
             )
             recalls |= {f"{name}_by_matches": recall for name, recall in of_matches.items()}
             if uses_matches:
@@ -309,7 +311,8 @@ class MapEvaluation:
         """
         if self.matching == Matching.OFF:
             return None, None
-        chosen = self._draw_to_match(sorted({sample.photo for sample in samples}))
+        sampled = sorted({sample.photo for sample in samples})
+        chosen = _draw(sampled, MAX_MATCHED_SAMPLE, seed=len(sampled))
         matched: list[PlaceSample] = []
         for photo in chosen:
             matched += own_photos.samples([photo], scores.spread, self._match_own_photo)
@@ -336,14 +339,6 @@ class MapEvaluation:
             ranking = self.search.rank_similar(photo, len(others), among) or []
             scores += [hit.score for hit, _ in ranking]
         return Background.of(scores)
-
-    def _draw_to_match(self, photos: Sequence[Photo]) -> list[Photo]:
-        """Draw those of a sample that are matched, always the same."""
-        if len(photos) <= MAX_MATCHED_SAMPLE:
-            return list(photos)
-        rng = np.random.default_rng(len(photos))
-        chosen = rng.choice(len(photos), MAX_MATCHED_SAMPLE, replace=False)
-        return [photos[index] for index in sorted(chosen.tolist())]
 
     def _order_by_matches(
         self, query: GeotaggedPhoto, ranked: Iterable[GeotaggedPhoto]

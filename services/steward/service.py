@@ -24,7 +24,7 @@ from services.steward.webhooks import WebhookDispatcher
 from shared.catalog.installation import open_installation_store
 from shared.catalog.processes import process_heartbeat
 from shared.config.settings import Settings
-from shared.jobs.celery_wakeups import CeleryWakeups, create_celery_app
+from shared.jobs.celery_messages import CeleryJobMessages, create_celery_app
 from shared.search_api.client import HttpSearchClient
 from shared.telemetry.metrics_server import serve_metrics
 
@@ -39,7 +39,7 @@ def serve_steward(settings: Settings, announce: Announce) -> None:
     with (
         service_process(settings, "steward") as catalog,
         process_heartbeat(catalog, "steward"),
-        contextlib.closing(CeleryWakeups(create_celery_app(settings), settings)) as wakeups,
+        contextlib.closing(CeleryJobMessages(create_celery_app(settings), settings)) as wakeups,
         HttpSearchClient.from_settings(settings) as search,
         serve_metrics(settings, registry := CollectorRegistry()),
     ):

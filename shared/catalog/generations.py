@@ -7,7 +7,6 @@ BUILDING --complete, loaded by search--> ACTIVE --another is activated--> RETIRE
 from __future__ import annotations
 
 from datetime import datetime
-from enum import StrEnum
 from typing import Any
 from uuid import UUID
 
@@ -25,21 +24,9 @@ from shared.catalog.database.base import (
     list_newest,
     partial_index,
 )
+from shared.enums import GenerationState as GenerationState
+from shared.enums import RowType as RowType
 from shared.ids import new_id
-
-
-class GenerationState(StrEnum):
-    BUILDING = "building"  # photos are being described into it; not searched yet
-    ACTIVE = "active"  # serves the map's searches
-    RETIRED = "retired"  # was active until another was activated; deleted after a grace period
-    ABANDONED = "abandoned"  # never became complete; deleted after a grace period
-
-
-class RowType(StrEnum):
-    """NumPy type of stored descriptor rows."""
-
-    FLOAT32 = "float32"
-    FLOAT16 = "float16"  # half of the storage, merges and backups
 
 
 class Generation(Journaled, Base):

@@ -23,7 +23,8 @@ jobs of a batch share one token.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from enum import IntEnum, StrEnum
 from typing import Any
@@ -43,21 +44,13 @@ from shared.catalog.database.base import (
     list_newest,
     partial_index,
 )
+from shared.enums import JobState as JobState
 from shared.ids import new_id
 from shared.telemetry.tracing import (
     MAX_REQUEST_ID_CHARACTERS,
     current_request_id,
     current_traceparent,
 )
-
-
-class JobState(StrEnum):
-    QUEUED = "queued"  # waits for a worker, or for what `waiting_for` names
-    RUNNING = "running"  # a worker has its lease, or it pauses between two slices
-    SUCCEEDED = "succeeded"  # completed: its effect is visible
-    FAILED = "failed"  # ended with `error`; may be retried
-    CANCELLED = "cancelled"  # ended on request; may be retried
-
 
 UNFINISHED_STATES = (JobState.QUEUED, JobState.RUNNING)
 
@@ -76,33 +69,59 @@ class JobKind(StrEnum):
     BATCH = "batch"  # import many photos, each with its own job (`shared.catalog.batch_items`)
 
 
-FIT_JOBS = (JobKind.FIT, JobKind.PCA)
-CHILD_PROCESS_JOBS = (*FIT_JOBS, JobKind.RECONSTRUCT)  # run beside the describing of photos
-MODEL_CHANGE_JOBS = (*FIT_JOBS, JobKind.IMPORT, JobKind.SWITCH)
+class RunBy(StrEnum):
+    """What claims and runs the jobs of a kind."""
 
-# Their parameter `object_key` is the key of an upload (`CHECKPOINTS`), or None.
-UPLOAD_JOBS = (JobKind.ADD_MODEL, JobKind.RECONSTRUCT)
+    EXTRACTOR = "extractor"  # between two batches of photos
+    FIT_WORKER = "fit worker"  # a thread of the extractor, in child processes beside the photos
+    STEWARD = "steward"  # jobs that need only search
+
+
+@dataclass(frozen=True, slots=True)
+class JobType:
+    """How the jobs of a kind are shown and run."""
+
+    title: str  # in plain words, for the page and the command
+    run_by: RunBy = RunBy.EXTRACTOR
+    in_batches: bool = False  # claimed together: each is the description of one photo
+    changes_model: bool = False  # one at a time in each map, in slices, up to a switch
+    in_slices: bool = False  # between two slices the job is `running` without a lease
+    has_upload: bool = False  # parameter `object_key` is the key of an upload, or None
+    on_status_page: bool = True  # among the newest jobs
+
+
+JOB_TYPES = {
+    JobKind.INDEX: JobType("Photo", in_batches=True),
+    JobKind.REINDEX: JobType("Photo for a new model", in_batches=True, on_status_page=False),
+    JobKind.DESCRIBE: JobType("Query photo", in_batches=True, on_status_page=False),
+    JobKind.FIT: JobType("Improving the map", RunBy.FIT_WORKER, changes_model=True),
+    JobKind.IMPORT: JobType("Vocabulary import", changes_model=True),
+    JobKind.SWITCH: JobType("Switch", changes_model=True),
+    JobKind.PCA: JobType("PCA", RunBy.FIT_WORKER, changes_model=True),
+    JobKind.ADD_MODEL: JobType("New model", has_upload=True),
+    JobKind.EVALUATE: JobType("Evaluation", RunBy.STEWARD),
+    JobKind.RECONSTRUCT: JobType("Reconstruction", RunBy.FIT_WORKER, has_upload=True),
+    JobKind.BATCH: JobType("Batch", RunBy.STEWARD, in_slices=True),
+}
+
+
+def _kinds(condition: Callable[[JobType], bool]) -> tuple[JobKind, ...]:
+    return tuple(kind for kind, job_type in JOB_TYPES.items() if condition(job_type))
+
+
+DRAINED_JOBS = _kinds(lambda kind: kind.run_by == RunBy.EXTRACTOR)
+FIT_WORKER_JOBS = _kinds(lambda kind: kind.run_by == RunBy.FIT_WORKER)
+EXTRACTOR_JOBS = DRAINED_JOBS + FIT_WORKER_JOBS
+STEWARD_JOBS = _kinds(lambda kind: kind.run_by == RunBy.STEWARD)
+SINGLE_CLAIM_JOBS = _kinds(lambda kind: kind.run_by != RunBy.STEWARD and not kind.in_batches)
+MODEL_CHANGE_JOBS = _kinds(lambda kind: kind.changes_model)
+CHECKPOINTED_JOBS = _kinds(lambda kind: kind.changes_model or kind.in_slices)
+UPLOAD_JOBS = _kinds(lambda kind: kind.has_upload)
+STATUS_PAGE_JOBS = _kinds(lambda kind: kind.on_status_page)
 
 # Retention of query photos: long enough for a client that polls, and for the background of a track;
 # short, because nobody has chosen to store these photos.
 QUERY_TTL_SECONDS = 3600.0
-
-# Extractors run the jobs that need photos and a backbone, the steward those that need only search.
-EXTRACTOR_JOBS = (
-    JobKind.INDEX,
-    JobKind.REINDEX,
-    JobKind.DESCRIBE,
-    JobKind.ADD_MODEL,
-    JobKind.RECONSTRUCT,
-    *MODEL_CHANGE_JOBS,
-)
-STEWARD_JOBS = (JobKind.EVALUATE, JobKind.BATCH)
-
-# Run in slices: between two slices they are `running` without a lease.
-CHECKPOINTED_JOBS = (*MODEL_CHANGE_JOBS, JobKind.BATCH)
-
-# Claimed one at a time: each is as much work as a batch, or changes the input of the next one.
-SINGLE_CLAIM_JOBS = (*MODEL_CHANGE_JOBS, JobKind.ADD_MODEL, JobKind.RECONSTRUCT)
 
 
 class Priority(IntEnum):

@@ -13,7 +13,6 @@ from __future__ import annotations
 import time
 from dataclasses import asdict, dataclass
 from datetime import datetime
-from enum import StrEnum
 from typing import Any
 from uuid import UUID
 
@@ -53,6 +52,7 @@ from shared.catalog.photos import (
     is_geotagged,
     select_live_photos,
 )
+from shared.enums import Matching as Matching
 from shared.errors import Conflict, NotFound
 from shared.ids import new_id
 from shared.place_paths import look_like_paths
@@ -60,14 +60,6 @@ from shared.place_paths import look_like_paths
 DEFAULT_MAP = "default"
 MAP_NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 DELETED_NAME_PREFIX = "deleted/"  # valid names of maps have no slash
-
-
-class Matching(StrEnum):
-    """Whether local features of a map's photos are computed and matched."""
-
-    AUTO = "auto"  # until an evaluation has shown that they do not improve the answers
-    ON = "on"
-    OFF = "off"
 
 
 class Map(Journaled, Base):
@@ -98,6 +90,8 @@ class Map(Journaled, Base):
     matching: Mapped[Matching] = mapped_column(
         sa.String(20), default=Matching.AUTO, server_default=Matching.AUTO
     )
+    elsewhere: Mapped[float | None] = mapped_column(sa.Float)
+    """Share of its queries that are from elsewhere; null: ELSEWHERE_SHARE."""
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
@@ -111,6 +105,7 @@ def create_map(
     row_type: RowType = RowType.FLOAT32,
     auto_fit: bool = True,
     matching: Matching = Matching.AUTO,
+    elsewhere: float | None = None,
 ) -> Map:
     """Create an empty map; Conflict (`map_exists`) when the name is taken.
 
@@ -125,6 +120,7 @@ def create_map(
         row_type=row_type,
         auto_fit=auto_fit,
         matching=matching,
+        elsewhere=elsewhere,
     )
     try:
         with session.begin_nested():

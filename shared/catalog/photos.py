@@ -28,7 +28,7 @@ from shared.catalog.database.base import (
     filename_trigrams,
     partial_index,
 )
-from shared.catalog.photo_role import PhotoRole as PhotoRole
+from shared.enums import PhotoRole as PhotoRole
 from shared.errors import Gone, NotFound
 from shared.ids import new_id
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from datetime import datetime
-from enum import StrEnum
 from typing import Any
 from uuid import UUID
 
@@ -21,18 +20,13 @@ from shared.catalog.database.base import (
 )
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import Map
+from shared.enums import VocabularyOrigin as VocabularyOrigin
 from shared.errors import Conflict, Misconfigured
 from shared.extractor_config.configs import (
     MIN_PHOTOS_TO_FIT,
     get_extractor_config,
 )
 from shared.ids import new_id
-
-
-class VocabularyOrigin(StrEnum):
-    SHIPPED = "shipped"  # shipped with the extractor: fitted on photos of other places
-    FITTED = "fitted"  # fitted on the map's own photos
-    IMPORTED = "imported"  # uploaded by the user
 
 
 class Vocabulary(Journaled, Base):

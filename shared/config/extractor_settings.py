@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import Literal, Self
@@ -27,6 +28,9 @@ EXTRACTORS_BY_DINO_MODEL = {
     for name in EXTRACTOR_CONFIGS
     if name.startswith("anyloc-")
 }
+
+GPU_BATCH_PHOTOS = 64  # a GPU runs more at once hardly faster
+MAX_DECODE_PROCESSES = 64
 
 
 class ExtractorSettings(BaseSettings):
@@ -86,10 +90,16 @@ class ExtractorSettings(BaseSettings):
         16,
         ge=1,
         le=1024,
-        description="maximum photos of an inference batch; batch uploads wait while 32 times as "
-        "many are queued",
+        description="maximum photos of an inference batch, unless set 64 on a GPU; batch uploads "
+        "wait while 32 times as many are queued",
     )
-    decode_processes: int = Field(2, ge=1, le=64, description="number of decoding processes")
+    decode_processes: int = Field(
+        2,
+        ge=1,
+        le=MAX_DECODE_PROCESSES,
+        description="number of decoding processes, unless set a quarter of the processors, at "
+        "least 2; with a GPU, all but two of them",
+    )
     pool_without_vocabulary: bool = Field(
         True,
         description="describe the photos of a map whose extractor is shipped without a vocabulary "
@@ -100,6 +110,16 @@ class ExtractorSettings(BaseSettings):
         description="local features of new generations, by which photos are matched: xfeat (at "
         "most 70 kB a photo) or aliked-n16 (132 kB; slower, better; needs the extra `lightglue`)",
     )
+
+    def for_device(self, device: str) -> Self:
+        """Return the settings of a worker on `cpu` or `cuda`, with what is unset chosen for it."""
+        processors = len(os.sched_getaffinity(0))
+        decoders = processors - 2 if device == "cuda" else processors // 4
+        chosen = {"decode_processes": min(max(decoders, 2), MAX_DECODE_PROCESSES)}
+        if device == "cuda":
+            chosen["batch_photos"] = GPU_BATCH_PHOTOS
+        unset = chosen.keys() - self.model_fields_set
+        return self.model_copy(update={name: chosen[name] for name in unset})
 
     @field_validator("code_allowed")
     @classmethod

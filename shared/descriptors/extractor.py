@@ -20,9 +20,9 @@ from shared.descriptors.aggregators import POOLINGS
 from shared.descriptors.backbones import Backbone, backbone_class
 from shared.descriptors.inference import (
     BatchSizeLimit,
-    PhotoTooLargeForGpu,
     Precision,
     autocast,
+    model_fits_gpu,
     run_in_batches,
 )
 from shared.descriptors.pca_whitening import PcaProjection
@@ -74,13 +74,15 @@ class Extractor:
             limit: The batch size limit that was measured for `backbone`.
 
         Raises:
-            Misconfigured: `weights_missing`, `weights_unusable`, `torchhub_unusable`.
+            Misconfigured: `weights_missing`, `weights_unusable`, `torchhub_unusable`,
+                `gpu_out_of_memory`.
             PlacewiseError: For a checkpoint, as `TrainedBackbone.load` raises.
         """
         self.config = config
         self.precision: Precision = precision
         self.limit = limit or BatchSizeLimit(device)
-        self.backbone = backbone or backbone_class(config).load(config, device, dino_weights)
+        with model_fits_gpu(config.name):
+            self.backbone = backbone or backbone_class(config).load(config, device, dino_weights)
         if config.preprocessing is None:
             assert self.backbone.preprocessing is not None
             self.preprocessing = self.backbone.preprocessing
@@ -166,16 +168,9 @@ class Extractor:
         height, width = self.preprocessing.typical_size
         batch_size = self.limit.photos(photos, height * width)
         blank = [np.zeros((height, width, 3), np.uint8)] * batch_size
-        try:
+        with model_fits_gpu(self.config.name):
             for _ in self._run_in_batches(blank, lambda features: features):
                 pass
-        except PhotoTooLargeForGpu as error:
-            raise Misconfigured(
-                "gpu_out_of_memory",
-                f"After loading the weights of {self.config.name}, the GPU has no memory left for "
-                "a single photo. Check what else uses the GPU (`nvidia-smi`), or configure a "
-                "smaller extractor or DEVICE=cpu.",
-            ) from error
 
     def features(self, pixels: Pixels) -> torch.Tensor:
         """Compute (B, patches, width) float32 features of (B, H, W, 3) pixels, on the device."""

@@ -4,8 +4,8 @@ Batch size: a forward pass that runs out of GPU memory is retried with half of i
 passes do not exceed that size. Memory grows with pixels, so the limit counts pixels, not photos.
 
 Precision: `float32`, or `bfloat16` where that loses little accuracy. bfloat16 uses autocast:
-weights, residual sums, normalisations and everything after the backbone stay float32; matrix
-products and convolutions run in bfloat16. It has float32's range, so that what fits into one fits
+residual sums, normalisations and everything after the backbone stay float32; matrix products and
+convolutions run in bfloat16. It has float32's range, so that what fits into one fits
 into the other, and 8 bits of precision. In float32, TF32 (11 bits of precision), which PyTorch
 allows for convolutions by default, is disabled.
 """
@@ -19,16 +19,18 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 import numpy as np
 import torch
 
-from shared.errors import Unprocessable
+from shared.errors import Misconfigured, Unprocessable
 from shared.extractor_config.configs import ExtractorConfig
 from shared.imaging.preprocessing import Pixels
 
 log = logging.getLogger(__name__)
+
+Result = TypeVar("Result")
 
 DEFAULT_PHOTO_PIXELS = 224 * 224  # the pixels of one photo, for the default size of a batch
 # A CPU's cache keeps the layers of so many pixels. With 16 photos of 256 x 448 pixels at once,
@@ -67,6 +69,19 @@ class PhotoTooLargeForGpu(Unprocessable):
         return error
 
 
+@contextlib.contextmanager
+def model_fits_gpu(name: str) -> Iterator[None]:
+    """Raise Misconfigured (`gpu_out_of_memory`) if the block finds no memory for a model."""
+    try:
+        yield
+    except (torch.cuda.OutOfMemoryError, PhotoTooLargeForGpu) as error:
+        raise Misconfigured(
+            "gpu_out_of_memory",
+            f"The GPU's memory does not hold the weights of {name} and a single photo. Check what "
+            "else uses the GPU (`nvidia-smi`), or configure a smaller extractor or DEVICE=cpu.",
+        ) from error
+
+
 class BatchSizeLimit:
     """The largest batch of one loaded network that fits the GPU, or the cache of a CPU.
 
@@ -96,10 +111,10 @@ class BatchSizeLimit:
 
 def run_in_batches(
     photos: Collection[Pixels],
-    run: Callable[[Pixels], torch.Tensor],
+    run: Callable[[Pixels], Result],
     limit: BatchSizeLimit,
     device: torch.device,
-) -> Iterator[tuple[list[int], torch.Tensor]]:
+) -> Iterator[tuple[list[int], Result]]:
     """Run `run` on batches of photos of the same size; halve the batch when memory runs out.
 
     Args:
@@ -134,8 +149,8 @@ def run_in_batches(
 
 
 def _run_unless_out_of_memory(
-    run: Callable[[Pixels], torch.Tensor], pixels: Pixels, device: torch.device
-) -> torch.Tensor | None:
+    run: Callable[[Pixels], Result], pixels: Pixels, device: torch.device
+) -> Result | None:
     """Return None if the GPU runs out of memory."""
     with _gpu_lock if device.type == "cuda" else contextlib.nullcontext():
         try:

@@ -7,6 +7,9 @@ with three changes: k-means++ seeding, reseeding of empty clusters, and points r
                                 counts them: after each batch c is the mean of its points
     Lloyd                       all points against the same centres, which then move to the means
 
+Points and centres are on one device. Nothing is summed in an order that is left to a GPU's threads,
+so that a repeated fit gives the same centres.
+
 `shared.descriptors.vocabulary_fit` schedules the passes.
 """
 
@@ -16,7 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, one_hot
 
 
 def choose_seeds(
@@ -35,12 +38,11 @@ def choose_seeds(
     distances = _squared_distances(points, points[chosen[0]])
     on_seed(1)
     while len(chosen) < count:
-        total = float(distances.sum(dtype=torch.float64))
+        cumulative = distances.cpu().cumsum(0, dtype=torch.float64)
+        total = float(cumulative[-1])
         if total > 0:
-            target = float(torch.rand(1, generator=generator, dtype=torch.float64)) * total
-            cumulative = distances.cumsum(0, dtype=torch.float64)
-            position = torch.searchsorted(cumulative, torch.tensor([target], dtype=torch.float64))
-            index = min(int(position), len(points) - 1)
+            target = torch.rand(1, generator=generator, dtype=torch.float64) * total
+            index = min(int(torch.searchsorted(cumulative, target)), len(points) - 1)
         else:  # fewer distinct points than seeds
             index = int(torch.randint(len(points), (1,), generator=generator))
         chosen.append(index)
@@ -68,7 +70,7 @@ class KMeansPass:
     def begin(cls, centres: torch.Tensor) -> KMeansPass:
         """Start a pass with centres of this shape (K, D)."""
         return cls(
-            counts=torch.zeros(len(centres), dtype=torch.int64),
+            counts=torch.zeros(len(centres), dtype=torch.int64, device=centres.device),
             sums=torch.zeros_like(centres),
             similarity=0.0,
             worst=centres[:0],
@@ -79,7 +81,10 @@ class KMeansPass:
         """Assign the (n, D) unit points to their most similar centres."""
         cosines, labels = (points @ normalize(centres, dim=-1).T).max(dim=-1)
         self.counts += torch.bincount(labels, minlength=len(centres))
-        self.sums.index_add_(0, labels, points)
+        if points.is_cuda:  # index_add_ would sum in any order there
+            self.sums += one_hot(labels, len(centres)).to(points.dtype).T @ points
+        else:
+            self.sums.index_add_(0, labels, points)
         self.similarity += float(cosines.sum(dtype=torch.float64))
         norms = centres.norm(dim=-1)[labels]
         distances = 1 - 2 * cosines * norms + norms**2

@@ -124,7 +124,11 @@ def fit_vocabulary(
             described += len(batch)
             on_progress("describing", described, photos)
         fit = fit_centres(
-            patches, clusters, seed, lambda done, total: on_progress("clustering", done, total)
+            patches,
+            clusters,
+            seed,
+            lambda done, total: on_progress("clustering", done, total),
+            extractor.backbone.device,
         )
     provenance = fit_provenance(
         extractor, fit, requested_clusters=clusters, photos=described, seed=seed

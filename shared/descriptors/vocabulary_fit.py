@@ -6,7 +6,8 @@
    patches as well as a hundred of Lloyd's (`lab/benchmarks/RESULTS.md`).
 3. Lloyd's passes, until the centres converge: each is then the mean of its patches.
 
-Memory holds one batch of points, the sample for k-means++, and a few arrays of the centres' size.
+Memory holds one batch of points, the sample for k-means++, and a few arrays of the centres' size; a
+GPU holds all points, which are at most PATCHES_BYTES (`shared.descriptors.patches`).
 scikit-learn's MiniBatchKMeans assigns points by Euclidean distance; VLAD assigns them by cosine.
 """
 
@@ -65,8 +66,12 @@ def fit_centres(
     clusters: int,
     seed: int,
     on_progress: Callable[[int, int], object] = lambda done, total: None,
+    device: torch.device = torch.device("cpu"),
 ) -> FittedCentres:
-    """Fit centres to points. Deterministic: the same points and seed give the same centres.
+    """Fit centres to points.
+
+    Deterministic: the same points, seed and device give the same centres. Those of two devices
+    differ by float32 rounding.
 
     Args:
         clusters: Requested number of centres, reduced so that each has at least
@@ -74,6 +79,7 @@ def fit_centres(
         seed: Seed of k-means++ and of the batches' order.
         on_progress: Called with the seeds and batches done and their maximum; a fit that converges
             has fewer.
+        device: Where to compute.
 
     Raises:
         Unprocessable: `no_photos` if there are no points.
@@ -91,8 +97,12 @@ def fit_centres(
     per_block = max(1, BLOCK_BYTES // (rows * points.width * 4))
     total = clusters + (MINI_BATCH_PASSES + SETTLING_PASSES) * batches
     sample = max(SEEDING_PER_CLUSTER * clusters, SEEDING_BYTES // (4 * points.width))
+    read = points.read
+    if device.type != "cpu":
+        on_device = points.read(0, count).to(device)
+        read = lambda begin, end: on_device[begin:end]  # noqa: E731
     centres = choose_seeds(
-        points.read(0, min(sample, count)), clusters, seed, lambda done: on_progress(done, total)
+        read(0, min(sample, count)), clusters, seed, lambda done: on_progress(done, total)
     )
     passes, settled, similarity = 0, False, 0.0
     while not settled:
@@ -100,7 +110,7 @@ def fit_centres(
         order = _shuffled(batches, per_block, [seed, passes]) if is_mini_batch else range(batches)
         statistics = KMeansPass.begin(centres)
         for done, batch in enumerate(order, start=1):
-            statistics.accumulate(points.read(edges[batch], edges[batch + 1]), centres)
+            statistics.accumulate(read(edges[batch], edges[batch + 1]), centres)
             if is_mini_batch:
                 centres = statistics.means(centres)
             if done < batches:
@@ -112,7 +122,7 @@ def fit_centres(
             not is_mini_batch and movement <= TOLERANCE
         )
         on_progress(total if settled else clusters + passes * batches, total)
-    distinct: NDArray[np.float32] = np.unique(centres.numpy(), axis=0)
+    distinct: NDArray[np.float32] = np.unique(centres.cpu().numpy(), axis=0)
     kept = parse_centres(distinct[np.linalg.norm(distinct, axis=1) > 1e-6])
     return FittedCentres(kept, count, passes, similarity)
 

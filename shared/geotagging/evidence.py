@@ -94,6 +94,8 @@ class PictureEvidence:
     photo_count: int
     """number of photos of the map"""
     pose: PosePosition | None = None
+    headline: str = ""
+    """of the estimate; the reason if nothing is proposed"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,8 +295,10 @@ class TimeNeighbours:
         position = interpolate_position(known, photo.time, max_speed_mps)
         return position and replace(position, same_camera=False)
 
-    def why_unknown(self, photo: DatedPhoto) -> str:
-        """Say why nothing is known about the place of a photo."""
+    def why_unknown(self, photo: DatedPhoto, picture: PictureEvidence | None) -> str:
+        """Say why no position is proposed for a photo."""
+        if picture is not None and picture.headline:
+            return picture.headline
         if photo.time is not None and not photo.time_zone_is_known:
             return "nothing is known about its place, and the time zone of its clock is missing"
         return "nothing is known about its place"

@@ -49,8 +49,11 @@ def propose_position(
 ) -> Proposal | None:
     """Return the most probable circle of `radius_m`, given all that is known about a photo.
 
-    None if no source has a position, or the photo was certainly taken elsewhere.
+    None if no source has a position, the photo was certainly taken elsewhere, or its picture is all
+    that is known and probably not of this map.
     """
+    if picture is not None and picture.not_in_map > CONTRADICTION and not (neighbours or track):
+        return None
     plane = _plane(picture, neighbours, track)
     if plane is None:
         return None

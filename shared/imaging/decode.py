@@ -105,7 +105,9 @@ def decode_photo(
             pixels = preprocessing.apply(upright if preprocessing.upright else as_stored)
             thumbnail = _small_jpeg(upright, THUMBNAIL_PIXELS, quality=85)
             preview = _small_jpeg(upright, PREVIEW_PIXELS, quality=80) if with_preview else None
-            small = np.array(_shrink(upright, WORKING_SIDE)) if for_detection else None
+            small = None
+            if for_detection:  # keypoints are found as well as in a bicubic copy, in half its time
+                small = np.asarray(_shrink(upright, WORKING_SIDE, Image.Resampling.BILINEAR))
             return DecodedPhoto(pixels, thumbnail, preview, size, small)
     except UnidentifiedImageError as error:
         raise Unprocessable(
@@ -180,12 +182,16 @@ def to_rgb(image: Image.Image) -> Image.Image:
     return on_black
 
 
-def _shrink(rgb: Image.Image, longer_side: int) -> Image.Image:
+def _shrink(
+    rgb: Image.Image,
+    longer_side: int,
+    resampling: Image.Resampling = Image.Resampling.BICUBIC,
+) -> Image.Image:
     """Return a copy whose longer side has at most `longer_side` pixels."""
     scale = min(1.0, longer_side / max(rgb.size))
     size = max(1, round(rgb.width * scale)), max(1, round(rgb.height * scale))
     # Averaged over integer blocks first: a fraction of the time, no visible difference.
-    return rgb.resize(size, Image.Resampling.BICUBIC, reducing_gap=1.0)
+    return rgb.resize(size, resampling, reducing_gap=1.0)
 
 
 def _small_jpeg(rgb: Image.Image, longer_side: int, *, quality: int) -> bytes:

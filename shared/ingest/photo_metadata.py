@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from shared.catalog.photo_role import PhotoRole
+from shared.enums import PhotoRole
 from shared.errors import InvalidRequest, PlacewiseError, TooLarge, invalid_field_error, shorten
 from shared.imaging.capture_place import MAX_ALTITUDE_M, is_null_island
 

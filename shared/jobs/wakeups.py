@@ -2,7 +2,7 @@
 
 The job table is the source of truth: a lost message delays a job by seconds and never loses it; a
 duplicate is harmless. Queries have a queue of their own, which workers look at first.
-`shared.jobs.celery_wakeups` sends the messages of separate services.
+`shared.jobs.celery_messages` sends the messages of separate services.
 """
 
 from __future__ import annotations

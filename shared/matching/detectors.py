@@ -9,18 +9,23 @@ from __future__ import annotations
 import hashlib
 import importlib
 import importlib.util
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from shared.descriptors.inference import BatchSizeLimit, run_in_batches
 from shared.errors import Misconfigured
+from shared.imaging.preprocessing import Pixels
 from shared.matching.features import MIN_SIDE, LocalFeatures
 
+Keypoints = Sequence[tuple[torch.Tensor, torch.Tensor]]
+
 MIN_CONTRAST = 1.0  # standard deviation of the samples, from 0 to 255
+STEP = 4  # of the rows and columns whose samples are looked at: all of them would take milliseconds
 
 DETECTORS = {
     "xfeat": "shared.matching.xfeat:XFeatDetector",
@@ -29,35 +34,65 @@ DETECTORS = {
 """Name -> module and class; the module is imported when the detector is loaded."""
 
 
-class Detector(Protocol):
-    """Finds keypoints and describes them."""
+class Detector:
+    """Finds keypoints and describes them; a subclass has a network.
 
-    model: str
-    """name and start of the weights' SHA-256, `xfeat@1a2b3c4d5e6f`: only features of the same model
-    can be matched"""
+    Attributes:
+        model: name and start of the weights' SHA-256, `xfeat@1a2b3c4d5e6f`: only features of the
+            same model can be matched.
+        dimension: of a descriptor.
+    """
+
     dimension: int
-    """of a descriptor"""
 
-    def detect(self, pixels: NDArray[np.uint8], size: tuple[int, int]) -> LocalFeatures:
-        """Return the local features of a photo.
+    def __init__(self, name: str, sha256: str, device: torch.device) -> None:
+        self.model = f"{name}@{sha256[:12]}"
+        self._device, self._limit = device, BatchSizeLimit(device)
+
+    def find_keypoints(self, pixels: Pixels) -> Keypoints:
+        """Return the keypoints of each of (B, H, W, 3) photos, best first.
+
+        They are (n, 2) x and y in pixels, where the centre of the first pixel is (0, 0), and (n,
+        dimension) L2-normalised descriptors.
+        """
+        raise NotImplementedError
+
+    def to_images(self, pixels: Pixels) -> torch.Tensor:
+        """Return (B, H, W, 3) photos as (B, 3, H, W) numbers from 0 to 1 on the device."""
+        return torch.from_numpy(pixels).to(self._device).permute(0, 3, 1, 2).float() / 255
+
+    @torch.inference_mode()
+    def detect(
+        self, photos: Sequence[NDArray[np.uint8]], sizes: Sequence[tuple[int, int]]
+    ) -> list[LocalFeatures]:
+        """Return the local features of photos.
+
+        Photos below MIN_SIDE have none, and neither have those of one colour: some detectors would
+        find keypoints in any photo.
 
         Args:
-            pixels: (height, width, 3) uint8 RGB, upright, at the working size.
-            size: (width, height) of the upright photo.
+            photos: (height, width, 3) uint8 RGB, upright, at the working size.
+            sizes: (width, height) of the upright photos.
+
+        Raises:
+            PhotoTooLargeForGpu: One photo alone exceeds the GPU's memory.
         """
-
-
-def detect_features(
-    detector: Detector, pixels: NDArray[np.uint8], size: tuple[int, int]
-) -> LocalFeatures:
-    """Return the local features of a photo as `Detector.detect`.
-
-    Photos below MIN_SIDE have none, and neither have those of one colour: some detectors would find
-    keypoints in any photo.
-    """
-    if max(size) < MIN_SIDE or pixels.std() < MIN_CONTRAST:
-        return LocalFeatures.empty(size, detector.dimension)
-    return detector.detect(pixels, size)
+        features = [LocalFeatures.empty(size, self.dimension) for size in sizes]
+        chosen = [
+            index
+            for index, (photo, size) in enumerate(zip(photos, sizes, strict=True))
+            if max(size) >= MIN_SIDE and photo[::STEP, ::STEP].std() >= MIN_CONTRAST
+        ]
+        pixels = [photos[index] for index in chosen]
+        for places, found in run_in_batches(pixels, self.find_keypoints, self._limit, self._device):
+            for place, keypoints in zip(places, found, strict=True):
+                height, width, _ = pixels[place].shape
+                points, descriptors = (part.float().cpu().numpy() for part in keypoints)
+                index = chosen[place]
+                features[index] = LocalFeatures.quantise(
+                    sizes[index], (width, height), points, descriptors
+                )
+        return features
 
 
 @cache
@@ -124,8 +159,3 @@ def _weights_unusable(network: torch.nn.Module, reason: str) -> Misconfigured:
         f"The weights do not fit {type(network).__name__}: {reason}. Install the versions of "
         "requirements.lock.",
     )
-
-
-def model_name(name: str, sha256: str) -> str:
-    """Return `Detector.model`."""
-    return f"{name}@{sha256[:12]}"

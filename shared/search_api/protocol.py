@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from shared.config.shards import SINGLE_SHARD
 from shared.geometry.colmap_model import ColmapCamera
+from shared.responses.similarity import PointPair, SeenPoint
 from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
 
 EXHAUSTIVE = "exhaustive"  # every row was compared exactly
@@ -69,7 +70,6 @@ class SearchRequest(_Message):
     min_version: int = Field(ge=0)
     k: int = Field(ge=1)
     photos: PhotoFilter = NO_FILTER
-    min_score: float | None = None
     exclude: tuple[UUID, ...] = ()
     mode: Mode = Mode.AUTO
     background: tuple[RowReference, ...] = ()
@@ -182,13 +182,6 @@ class MatchRequest(_Message):
     """whether the inliers themselves are returned"""
 
 
-class PointPair(_Message):
-    """Two points that show the same spot, in pixels of the upright photos."""
-
-    query: tuple[float, float]
-    photo: tuple[float, float]
-
-
 class PhotoMatches(_Message):
     """The matches of a query with one photo."""
 
@@ -256,15 +249,6 @@ class PoseRequest(_Message):
     """clockwise, by which the query was turned upright"""
     leave_out: tuple[UUID, ...] = ()
     """photos whose own points are not used: the query, if it is one of the map"""
-
-
-class SeenPoint(_Message):
-    """A point of a reconstruction that a query shows."""
-
-    query: tuple[float, float]
-    """in pixels of the upright query"""
-    point: tuple[float, float, float]
-    """in the component's frame"""
 
 
 class GeographicPose(_Message):

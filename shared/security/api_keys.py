@@ -11,19 +11,12 @@ import hashlib
 import ipaddress
 import secrets
 from collections.abc import Collection
-from enum import StrEnum
+
+from shared.enums import Scope as Scope
 
 API_KEY_PREFIX = "pw_"  # recognised by people and secret scanners
 KEY_BYTES = 32
 SHOWN_PREFIX_CHARACTERS = 11  # identifies a key in lists; reveals 48 of its 256 bits
-
-
-class Scope(StrEnum):
-    """Permissions of a key. `write` does not imply `read`: a camera only writes."""
-
-    READ = "read"  # read photos, jobs and statistics; query by photo
-    WRITE = "write"  # upload, change and delete photos; fit, evaluate, create maps
-    ADMIN = "admin"  # everything, including keys and webhooks
 
 
 ALL_SCOPES = frozenset(Scope)

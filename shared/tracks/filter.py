@@ -29,11 +29,11 @@ log-odds m (`PlaceModel.missing_log_odds`):
 
     outside   ~ outside' * sum_j p'(j) (n q(j)) ** w / sum_j p'(j) * exp(w * m)
 
-Two frames of the same view are not independent, so w = min(1, NEWS_WEIGHT * news), and news is the
-share of the evidence that is new: the squared Hellinger distance 1 - sum_j sqrt(d(j) d_before(j))
-of what exceeds the prior, d(j) ~ max(q(j) - 1 / n, 0), from the frame before. A camera that stands
-still adds nothing. SeqSLAM (Milford and Wyeth 2012) sums scores along lines of constant speed
-instead; it is the baseline of the evaluation.
+Two frames of the same view are not independent, so w = min(1, NOVELTY_WEIGHT * novelty), where the
+novelty is the share of the evidence that is new: the squared Hellinger distance
+1 - sum_j sqrt(d(j) d_before(j)) of what exceeds the prior, d(j) ~ max(q(j) - 1 / n, 0), from the
+frame before. A camera that stands still adds nothing. SeqSLAM (Milford and Wyeth 2012) sums scores
+along lines of constant speed instead; it is the baseline of the evaluation.
 
 The cost of a step does not depend on how many photos are near. Where these are too many, the hits
 and the nearest ones have a row of their own, and the others count in the sums that K and the
@@ -91,10 +91,10 @@ MAX_GAIN = 2.0
 """Where most frames gain more, one in a tunnel gains far less, and is still in the map"""
 MAX_GAIN_WEIGHT = 200.0
 """Number of frames that the gain is the mean of, at most: it follows the light and the weather"""
-NEWS_WEIGHT = 1.5
+NOVELTY_WEIGHT = 1.5
 """A frame with two thirds of new evidence counts in full"""
-STRETCH_SECONDS = 5.0
-"""of a map's sequence before and after a photo. How they share the evidence of a stretch counts in
+WINDOW_SECONDS = 5.0
+"""of a map's sequence before and after a photo. How they share the evidence of a window counts in
 full even where the camera sees nothing new, so that a camera that stands is not moved on"""
 PACE_SPREAD = 0.7
 """Standard deviation of a camera's pace around the learned one, in paces of the map"""
@@ -256,7 +256,7 @@ class TrackFilter:
             near_fix, fix_complete_m = _near_fix(self._graph, evidence.fix)
             targets = targets.union(near_fix)
         seen = _excess(evidence, count)
-        weight = min(1.0, NEWS_WEIGHT * _news(before.seen, seen))
+        weight = min(1.0, NOVELTY_WEIGHT * _novelty(before.seen, seen))
         # A camera that sees nothing new has not moved on.
         drift = weight * seconds * np.array(before.velocity)
         reached = partial(self._kernel, sources, targets, complete_m, seconds, evidence, drift)
@@ -284,8 +284,8 @@ class TrackFilter:
 
         likelihoods, likelihood_elsewhere = _likelihoods(targets, evidence, count)
         in_map = float(predicted.sum()) + predicted_elsewhere
-        stretches = _stretch_likelihoods(targets, predicted, likelihoods)
-        weights = likelihoods * stretches ** (weight - 1)
+        windows = _window_likelihoods(targets, predicted, likelihoods)
+        weights = likelihoods * windows ** (weight - 1)
         weight_elsewhere = likelihood_elsewhere**weight
         fit = float(predicted @ weights) + predicted_elsewhere * weight_elsewhere
         direction = before.direction
@@ -355,7 +355,7 @@ class TrackFilter:
             return belief
         limit = self._motion.max_speed_mps / self._motion.typical_speed_mps
         seen = (after.seconds - before.seconds) / seconds
-        if abs(seen) > limit + STRETCH_SECONDS / seconds:
+        if abs(seen) > limit + WINDOW_SECONDS / seconds:
             return replace(belief, direction=0.0)  # carried away
         pace = belief.pace + certainty * (seen - belief.pace) / PACE_FRAMES
         return replace(belief, pace=float(np.clip(pace, -limit, limit)))
@@ -587,7 +587,7 @@ def _excess(evidence: FrameEvidence, count: int) -> dict[str, float]:
     return {h.photo: h.probability - prior for h in evidence.hits if h.probability > prior}
 
 
-def _news(seen: dict[str, float], now: dict[str, float]) -> float:
+def _novelty(seen: dict[str, float], now: dict[str, float]) -> float:
     """Return the share of a frame's evidence that the frame before did not have."""
     if not seen or not now:
         return 1.0
@@ -610,20 +610,20 @@ def _place(photos: PhotoTable, probabilities: FloatArray) -> _Place | None:
     best = int(probabilities.argmax()) if len(probabilities) else -1
     if best < 0 or np.isnan(photos.seconds[best]) or not np.isnan(photos.latitudes[best]):
         return None
-    around = np.abs(photos.seconds - photos.seconds[best]) <= STRETCH_SECONDS
+    around = np.abs(photos.seconds - photos.seconds[best]) <= WINDOW_SECONDS
     around &= photos.sequences == photos.sequences[best]
     total = float(probabilities[around].sum())
     seconds = float(probabilities[around] @ photos.seconds[around]) / max(total, 1e-12)
     return _Place(photos.sequences[best], seconds, total)
 
 
-def _stretch_likelihoods(
+def _window_likelihoods(
     targets: PhotoTable, predicted: FloatArray, likelihoods: FloatArray
 ) -> FloatArray:
-    """Return the likelihood of the stretch around each photo: the mean over its predicted photos.
+    """Return the likelihood of the window around each photo: the mean over its predicted photos.
 
-    A stretch is what the map's sequence shows within STRETCH_SECONDS. A photo with coordinates, or
-    without a sequence, is a stretch of its own.
+    A window is what the map's sequence shows within WINDOW_SECONDS. A photo with coordinates, or
+    without a sequence, is a window of its own.
     """
     means = likelihoods.copy()
     chained = np.isnan(targets.latitudes) & ~np.isnan(targets.seconds)
@@ -631,8 +631,8 @@ def _stretch_likelihoods(
         rows = np.flatnonzero(chained & (targets.sequences == name))
         rows = rows[np.argsort(targets.seconds[rows], kind="stable")]
         seconds = targets.seconds[rows]
-        first = np.searchsorted(seconds, seconds - STRETCH_SECONDS, "left")
-        last = np.searchsorted(seconds, seconds + STRETCH_SECONDS, "right")
+        first = np.searchsorted(seconds, seconds - WINDOW_SECONDS, "left")
+        last = np.searchsorted(seconds, seconds + WINDOW_SECONDS, "right")
         sums = np.zeros((2, len(rows) + 1))
         np.cumsum([predicted[rows], predicted[rows] * likelihoods[rows]], axis=1, out=sums[:, 1:])
         prior, joint = sums[:, last] - sums[:, first]

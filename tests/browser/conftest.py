@@ -1,4 +1,4 @@
-"""A real browser on a real server, in which lies a small generated town."""
+"""A real browser on a real server, in which lies a small generated city."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
 
-from tests.browser.town import build_town, finished
+from tests.browser.city import build_city, finished
 from tests.support.server import ServerProcess
 
 CHROMIUM = "PLACEWISE_TEST_CHROMIUM"
@@ -48,19 +48,19 @@ def browser(chromium: str) -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="session")
-def town(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Town]:
-    """A server with the default extractor and a described, measured town in the map `riverside`."""
-    folder = tmp_path_factory.mktemp("town")
+def city(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CityServer]:
+    """A server with the default extractor and a described, measured city in the map `riverside`."""
+    folder = tmp_path_factory.mktemp("city")
     with ServerProcess(folder / "home", extractor="efficientnet-lite0-vlad") as server:
-        queries = build_town(server, folder / "city", MAP)
-        yield Town(server, queries)
+        queries = build_city(server, folder / "city", MAP)
+        yield CityServer(server, queries)
 
 
 MAP = "riverside"
 
 
 @dataclass(frozen=True, slots=True)
-class Town:
+class CityServer:
     server: ServerProcess
     queries: list[Path]
     """Photos that the map has never seen."""
@@ -125,7 +125,7 @@ class Visitor:
         self.page.on("console", self._on_console)
         self.page.on("request", self._on_request)
 
-    def untroubled(self) -> None:
+    def expect_no_error(self) -> None:
         """Check that the page shows no error."""
         expect(self.page.locator(".note.bad")).to_have_count(0)
 
@@ -159,9 +159,9 @@ def context(browser: Browser) -> Iterator[BrowserContext]:
 
 
 @pytest.fixture
-def visitor(context: BrowserContext, town: Town) -> Iterator[Visitor]:
-    """A window on the town; it must have no errors and send nothing to other servers."""
-    visiting = Visitor(context, town.url)
+def visitor(context: BrowserContext, city: CityServer) -> Iterator[Visitor]:
+    """A window on the city; it must have no errors and send nothing to other servers."""
+    visiting = Visitor(context, city.url)
     yield visiting
     assert visiting.faults == []
     assert visiting.foreign == []

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import FilePayload, Page, expect
 
-from tests.browser.conftest import Town, Visitor
+from tests.browser.conftest import CityServer, Visitor
 from tests.support.archives import tar_of, zip_of
 from tests.support.photos import encoded, photo_bytes, photo_image
 
@@ -25,42 +25,42 @@ def photo(number: int) -> FilePayload:
 
 
 @pytest.fixture
-def page(visitor: Visitor, town: Town, request: pytest.FixtureRequest) -> Iterator[Page]:
+def page(visitor: Visitor, city: CityServer, request: pytest.FixtureRequest) -> Iterator[Page]:
     """The view on a map of the test's own, with an extractor that takes no time."""
     name = f"add-{abs(hash(request.node.name)) % 10**9}"
     made = {"name": name, "extractor": "test-tiny-avg"}
-    assert town.server.client.post("/api/v1/maps", json=made).status_code == 201
-    visitor.page.goto(town.url)
+    assert city.server.client.post("/api/v1/maps", json=made).status_code == 201
+    visitor.page.goto(city.url)
     visitor.page.evaluate("name => localStorage.setItem('placewise-map', name)", name)
     yield visitor.visit("add")
-    town.server.client.delete(f"/api/v1/maps/{name}")
+    city.server.client.delete(f"/api/v1/maps/{name}")
 
 
 def add(page: Page, *files: FilePayload) -> None:
     page.locator("input[data-use=add]").set_input_files(list(files))
 
 
-def searchable(page: Page, town: Town) -> int:
+def searchable(page: Page, city: CityServer) -> int:
     name = page.evaluate("localStorage.getItem('placewise-map')")
-    answer = town.server.client.get(f"/api/v1/maps/{name}").json()
+    answer = city.server.client.get(f"/api/v1/maps/{name}").json()
     return int(answer["searchable"])
 
 
 def test_each_photo_but_hidden_ones_is_watched_until_it_can_be_found(
-    page: Page, town: Town
+    page: Page, city: CityServer
 ) -> None:
     add(page, {**photo(1), "name": "._1.jpg"}, photo(1), photo(2))
     expect(page.locator(".queue-row.done .state")).to_have_text(["Searchable", "Searchable"])
     expect(page.locator(".queue-row")).to_have_count(2)
     expect(page.locator(".summary h2")).to_have_text("2 photos added")
-    assert searchable(page, town) == 2
+    assert searchable(page, city) == 2
     add(page, photo(2))
     expect(page.locator(".queue-row.done")).to_have_count(3)
     expect(page.get_by_text("the map had it already")).to_be_visible()
 
 
 def test_a_refused_file_is_named_with_the_reason_and_the_others_go_on(
-    page: Page, town: Town
+    page: Page, city: CityServer
 ) -> None:
     add(page, NO_PHOTO, photo(1))
     refused = page.locator(".queue-row.failed")
@@ -74,25 +74,29 @@ def test_a_refused_file_is_named_with_the_reason_and_the_others_go_on(
     expect(page.get_by_role("button", name="Try")).to_have_count(0)
 
 
-def test_many_photos_go_as_a_batch_with_counters_and_named_errors(page: Page, town: Town) -> None:
+def test_many_photos_go_as_a_batch_with_counters_and_named_errors(
+    page: Page, city: CityServer
+) -> None:
     page.get_by_text("Details for these photos").click()
     page.get_by_label("Tags").fill("north, wing")
     add(page, *[photo(number) for number in range(30)], NO_PHOTO)
     expect(page.locator(".queue-row.failed .state")).to_have_text("30 added, 1 failed")
     expect(page.locator(".errors li strong")).to_have_text("notes.jpg")
-    assert searchable(page, town) == 30
+    assert searchable(page, city) == 30
     name = page.evaluate("localStorage.getItem('placewise-map')")
-    found = town.get("/search", map=name, tags="north,wing")
+    found = city.get("/search", map=name, tags="north,wing")
     assert found["total_found"] == 30
 
 
-def test_test_photos_are_measured_with_and_never_found(page: Page, town: Town) -> None:
+def test_test_photos_are_used_by_evaluations_and_are_no_search_results(
+    page: Page, city: CityServer
+) -> None:
     page.get_by_text("Details for these photos").click()
     page.get_by_label("Use").select_option("Test photos")
     add(page, photo(1))
     expect(page.locator(".queue-row.done")).to_have_count(1)
     name = page.evaluate("localStorage.getItem('placewise-map')")
-    [stored] = town.get("/search", map=name)["images"]
+    [stored] = city.get("/search", map=name)["images"]
     assert stored["role"] == "query"
     page.get_by_role("link", name="See the photos").click()
     expect(page.locator(".photo-card .corner")).to_have_text("test photo")
@@ -118,7 +122,9 @@ def test_a_photo_that_can_not_be_described_is_marked_with_the_reason(
     expect(page.get_by_role("row", name="Photo failed")).to_contain_text("can't be decoded")
 
 
-def test_a_photo_of_a_folder_is_named_with_its_path(page: Page, town: Town, tmp_path: Path) -> None:
+def test_a_photo_of_a_folder_is_named_with_its_path(
+    page: Page, city: CityServer, tmp_path: Path
+) -> None:
     folder = tmp_path / "Italy" / "Day 2"
     folder.mkdir(parents=True)
     (folder / "IMG_2078.jpg").write_bytes(photo_bytes(3))
@@ -136,7 +142,7 @@ def archive(name: str, data: bytes) -> FilePayload:
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 def test_the_photos_of_a_zip_keep_their_paths_and_get_the_details(
-    page: Page, town: Town, method: int
+    page: Page, city: CityServer, method: int
 ) -> None:
     page.get_by_text("Details for these photos").click()
     page.get_by_label("Tags").fill("north")
@@ -146,9 +152,9 @@ def test_the_photos_of_a_zip_keep_their_paths_and_get_the_details(
     expect(page.locator(".queue-row.done .state")).to_have_text("3 photos added")
     expect(page.get_by_text("1 file left out: no photos.")).to_be_visible()
     expect(page.get_by_text("hall/photos.csv of h.zip is not read here")).to_be_visible()
-    assert searchable(page, town) == 3
+    assert searchable(page, city) == 3
     name = page.evaluate("localStorage.getItem('placewise-map')")
-    images = town.get("/search", map=name, tags="north")["images"]
+    images = city.get("/search", map=name, tags="north")["images"]
     assert {image["relative_path"] for image in images} == set(photos)
 
 
@@ -168,13 +174,13 @@ def test_an_archive_that_the_page_can_not_read_says_what_to_do(page: Page) -> No
     expect(page.locator(".queue-row.failed .errors")).to_contain_text("can't be read, 1.jpg")
 
 
-def test_a_job_is_polled_where_events_do_not_arrive(page: Page, town: Town) -> None:
+def test_a_job_is_polled_where_events_do_not_arrive(page: Page, city: CityServer) -> None:
     page.route("**/events*", lambda route: route.abort())
     add(page, photo(1))
     expect(page.locator(".queue-row.done .state")).to_have_text("Searchable")
 
 
-def test_a_lost_connection_is_shown_and_the_photo_sent_again(page: Page, town: Town) -> None:
+def test_a_lost_connection_is_shown_and_the_photo_sent_again(page: Page, city: CityServer) -> None:
     page.route("**/api/v1/upload?*", lambda route: route.abort())
     add(page, photo(1))
     expect(page.locator(".queue-row.failed .errors")).to_contain_text("connection")

@@ -13,7 +13,7 @@ from PIL import Image
 from PIL.ExifTags import Base
 from playwright.sync_api import Page, Route, expect
 
-from tests.browser.conftest import Town, Visitor
+from tests.browser.conftest import CityServer, Visitor
 
 
 def ask(visitor: Visitor, photo: Path, answer: Any = None) -> Page:
@@ -48,10 +48,10 @@ def bands(levels: list[dict[str, Any]]) -> list[str]:
 
 @pytest.mark.parametrize("number", range(4))
 def test_each_level_and_each_match_has_its_probability(
-    visitor: Visitor, town: Town, number: int
+    visitor: Visitor, city: CityServer, number: int
 ) -> None:
-    photo = town.queries[number]
-    found = town.ask(photo)
+    photo = city.queries[number]
+    found = city.ask(photo)
     page = ask(visitor, photo)
     estimate, matches = found["estimate"], by_probability(found)
     probabilities = [level["probability"] for level in estimate["levels"]]
@@ -114,14 +114,14 @@ CIRCLE, FLOOR = "45.07000, 7.68000", "tower/floor 7"
 )
 def test_the_card_shows_the_headline_and_the_levels_that_it_stands_for(
     visitor: Visitor,
-    town: Town,
+    city: CityServer,
     levels: list[dict[str, Any]],
     answer: int | None,
     in_map: bool | None,
     title: str,
     place: str | None,
 ) -> None:
-    found = town.ask(town.queries[0])
+    found = city.ask(city.queries[0])
     found["estimate"] |= {
         "headline": "The answer in one sentence: 97 %",
         "reason": "The reason.",
@@ -136,7 +136,7 @@ def test_the_card_shows_the_headline_and_the_levels_that_it_stands_for(
         "radius_68_m": 42.4 if levels is CIRCLES else None,
         "radius_95_m": None,
     }
-    page = ask(visitor, town.queries[0], found)
+    page = ask(visitor, city.queries[0], found)
     expect(page.locator(".badge")).to_have_text(title)
     expect(page.locator(".headline")).to_have_text("The answer in one sentence: 97 %")
     expect(page.locator(".verdict .place")).to_have_text([place] if place else [])
@@ -169,12 +169,12 @@ NO_LEVELS: dict[str, Any] = {
 
 
 def test_a_guess_has_no_error_until_the_map_is_measured_and_is_then_answered_again(
-    visitor: Visitor, town: Town
+    visitor: Visitor, city: CityServer
 ) -> None:
-    found = town.ask(town.queries[0])
+    found = city.ask(city.queries[0])
     guess = found["estimate"] | NO_LEVELS | {**CENTER, "has_place": True}
     measured = found["estimate"] | {"levels": CIRCLES, "answer_level": 1, "reason": "Measured."}
-    described = town.get("/maps/riverside")
+    described = city.get("/maps/riverside")
     states = ["too_few_photos", "not_measured", "running", "measured"]
     reached = 0
 
@@ -196,7 +196,7 @@ def test_a_guess_has_no_error_until_the_map_is_measured_and_is_then_answered_aga
             json=described | {"measurement": states[reached], "located": 7}
         ),
     )
-    ask(visitor, town.queries[0])
+    ask(visitor, city.queries[0])
     expect(page.locator(".badge")).to_have_text("Best guess")
     expect(page.locator(".verdict .place")).to_have_text("45.07000, 7.68000")
     expect(page.locator(".verdict .radius, .levels, path.ring-68")).to_have_count(0)
@@ -211,14 +211,14 @@ def test_a_guess_has_no_error_until_the_map_is_measured_and_is_then_answered_aga
 
 
 def test_photos_without_a_place_keep_their_rank_and_are_counted(
-    visitor: Visitor, town: Town
+    visitor: Visitor, city: CityServer
 ) -> None:
-    found = town.ask(town.queries[0])
+    found = city.ask(city.queries[0])
     first, *others = found["similar_images"]
     first |= {"latitude": None, "longitude": None, "place": None, "match_probability": None}
     first["original_filename"] = "without.jpg"
     found |= {"matches_without_place": 1}
-    page = ask(visitor, town.queries[0], found)
+    page = ask(visitor, city.queries[0], found)
     expect(page.locator(".verdict")).to_contain_text(
         "1 of these 12 photos has neither coordinates nor a label."
     )
@@ -227,18 +227,20 @@ def test_photos_without_a_place_keep_their_rank_and_are_counted(
 
 
 def test_an_empty_map_finds_nothing_and_recommends_no_vocabulary(
-    visitor: Visitor, town: Town
+    visitor: Visitor, city: CityServer
 ) -> None:
-    found = town.ask(town.queries[0]) | {"similar_images": [], "vocabulary": "foreign"}
+    found = city.ask(city.queries[0]) | {"similar_images": [], "vocabulary": "foreign"}
     found["estimate"] |= {"levels": [], "in_map": None, "latitude": None, "place": None}
     found["estimate"] |= {"answer_level": None, "not_in_map_probability": None}
-    page = ask(visitor, town.queries[0], found)
+    page = ask(visitor, city.queries[0], found)
     expect(page.get_by_role("heading", name="No photo found")).to_be_visible()
     expect(page.locator(".verdict .hint")).to_have_count(0)
 
 
-def test_an_answer_without_a_place_is_no_guess(visitor: Visitor, town: Town) -> None:
-    found = town.ask(town.queries[0])
+def test_an_answer_without_a_place_is_not_shown_as_a_guess(
+    visitor: Visitor, city: CityServer
+) -> None:
+    found = city.ask(city.queries[0])
     found["estimate"] |= {
         **NO_LEVELS,
         **UNPLACED,
@@ -249,7 +251,7 @@ def test_an_answer_without_a_place_is_no_guess(visitor: Visitor, town: Town) -> 
     for photo in found["similar_images"]:
         photo |= {"latitude": None, "place": None, "match_probability": None}
     found["matches_without_place"] = len(found["similar_images"])
-    page = ask(visitor, town.queries[0], found)
+    page = ask(visitor, city.queries[0], found)
     expect(page.locator(".badge")).to_have_text("No estimate")
     expect(page.locator(".reason")).to_have_text("None has a place.")
     page.locator(".figures summary").click()
@@ -258,24 +260,24 @@ def test_an_answer_without_a_place_is_no_guess(visitor: Visitor, town: Town) -> 
     expect(page.locator(".figures thead")).not_to_contain_text("Same place")
 
 
-def test_long_names_of_matches_stay_on_a_narrow_phone(visitor: Visitor, town: Town) -> None:
-    found = town.ask(town.queries[0])
+def test_long_names_of_matches_stay_on_a_narrow_phone(visitor: Visitor, city: CityServer) -> None:
+    found = city.ask(city.queries[0])
     for photo in found["similar_images"]:
         name = {"original_filename": "a_name_without_a_space_" * 4 + ".jpg", "relative_path": None}
         photo |= {**name, "latitude": None, "place": "building/floor_7/" * 4}
     visitor.page.set_viewport_size({"width": 320, "height": 640})
-    page = ask(visitor, town.queries[0], found)
+    page = ask(visitor, city.queries[0], found)
     page.locator(".figures summary").click()
     assert page.evaluate("document.documentElement.scrollWidth") <= 320
 
 
 def test_a_large_photo_is_sent_as_a_small_upright_copy_and_gets_the_same_answer(
-    visitor: Visitor, town: Town, tmp_path: Path
+    visitor: Visitor, city: CityServer, tmp_path: Path
 ) -> None:
     sideways = Image.Exif()
     sideways[Base.Orientation] = 6
     large = tmp_path / "large.jpg"
-    with Image.open(town.queries[0]) as photo:
+    with Image.open(city.queries[0]) as photo:
         upright = photo.resize((5000, round(5000 * photo.height / photo.width)))
     upright.transpose(Image.Transpose.ROTATE_90).save(large, quality=95, exif=sideways)
     sent: list[bytes] = []
@@ -291,7 +293,7 @@ def test_a_large_photo_is_sent_as_a_small_upright_copy_and_gets_the_same_answer(
         assert small.size == (2048, round(2048 * upright.height / upright.width))
         assert not small.getexif()
     # The order of photos of one place, which have one probability, may differ.
-    matches = by_probability(town.ask(large))
+    matches = by_probability(city.ask(large))
     likeliest = matches[0]["match_probability"]
     best = {
         match["original_filename"]: match["similarity_score"]
@@ -305,7 +307,7 @@ def test_a_large_photo_is_sent_as_a_small_upright_copy_and_gets_the_same_answer(
     assert float(row.last.inner_text()) == pytest.approx(best[name], abs=0.05)
 
 
-def test_a_pasted_photo_is_a_query(visitor: Visitor, town: Town) -> None:
+def test_a_pasted_photo_is_a_query(visitor: Visitor, city: CityServer) -> None:
     page = visitor.visit("ask")
     expect(page.locator(".mosaic")).to_be_visible()
     page.evaluate(
@@ -314,20 +316,22 @@ def test_a_pasted_photo_is_a_query(visitor: Visitor, town: Town) -> None:
             data.items.add(new File([new Uint8Array(bytes)], "pasted.jpg", { type: "image/jpeg" }));
             document.dispatchEvent(new ClipboardEvent("paste", { clipboardData: data }));
         }""",
-        list(town.queries[0].read_bytes()),
+        list(city.queries[0].read_bytes()),
     )
     expect(page.locator(".verdict")).to_be_visible()
     expect(page.locator(".query-photo figcaption")).to_have_text("pasted.jpg")
 
 
-def test_of_two_questions_the_later_one_is_answered(visitor: Visitor, town: Town) -> None:
+def test_the_page_shows_the_result_of_the_later_of_two_queries(
+    visitor: Visitor, city: CityServer
+) -> None:
     page = visitor.visit("ask")
     held: list[Route] = []
     page.route("**/api/v1/similarity?*", lambda route: held.append(route), times=1)
-    page.locator("input[data-use=ask]").set_input_files(town.queries[0])
+    page.locator("input[data-use=ask]").set_input_files(city.queries[0])
     expect(page.get_by_role("heading", name="Looking for the place")).to_be_visible()
     page.locator("input[data-use=ask]").set_input_files(
-        {"name": "later.jpg", "mimeType": "image/jpeg", "buffer": town.queries[1].read_bytes()}
+        {"name": "later.jpg", "mimeType": "image/jpeg", "buffer": city.queries[1].read_bytes()}
     )
     expect(page.locator(".query-photo figcaption")).to_have_text("later.jpg")
     with page.expect_response("**/api/v1/similarity?*"):
@@ -346,9 +350,9 @@ def test_a_file_that_is_no_photo_is_rejected_with_the_reason(visitor: Visitor) -
 
 
 def test_a_match_is_shown_beside_the_photo_with_lines_between_their_points(
-    visitor: Visitor, town: Town
+    visitor: Visitor, city: CityServer
 ) -> None:
-    page = ask(visitor, town.queries[0])
+    page = ask(visitor, city.queries[0])
     match = page.locator(".match").first
     expect(match.locator(".match-points")).to_have_text(re.compile(r"^\d+ matching points?$"))
     points = int(match.locator(".match-points").inner_text().split()[0])
@@ -383,9 +387,9 @@ def test_a_match_is_shown_beside_the_photo_with_lines_between_their_points(
 
 
 def test_a_photo_of_the_map_finds_its_neighbours_and_not_itself(
-    visitor: Visitor, town: Town
+    visitor: Visitor, city: CityServer
 ) -> None:
-    stored = town.get("/search", role="database", limit=1)["images"][0]
+    stored = city.get("/search", role="database", limit=1)["images"][0]
     page = visitor.visit(f"ask/{stored['image_id']}")
     expect(page.locator(".match")).to_have_count(12)
     assert stored["original_filename"] not in page.locator(".matches").inner_text()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from playwright.sync_api import Dialog, expect
 
-from tests.browser.conftest import MAP, Town, Visitor
+from tests.browser.conftest import MAP, CityServer, Visitor
 from tests.support.photos import photo_bytes
 
 COVERED_LABELS = """() => {
@@ -18,12 +18,12 @@ COVERED_LABELS = """() => {
 }"""
 
 
-def bring_in(town: Town, *names: str) -> list[str]:
+def bring_in(city: CityServer, *names: str) -> list[str]:
     """Photos of the map `riverside` that no other test counts on; their ids."""
     ids = []
     for name in names:
         number = sum(map(ord, name))
-        answer = town.server.client.post(
+        answer = city.server.client.post(
             "/api/v1/upload",
             params={"map": MAP},
             files={"file": (name, photo_bytes(number))},
@@ -35,20 +35,20 @@ def bring_in(town: Town, *names: str) -> list[str]:
     return ids
 
 
-def test_photos_are_filtered_by_name_tag_and_place(visitor: Visitor, town: Town) -> None:
+def test_photos_are_filtered_by_name_tag_and_place(visitor: Visitor, city: CityServer) -> None:
     page = visitor.visit("photos")
-    everything = town.get("/search", limit=1)["total_found"]
+    everything = city.get("/search", limit=1)["total_found"]
     expect(page.locator(".total")).to_have_text(f"{everything} photos")
     page.get_by_label("Name").fill("SPRING")
-    spring = town.get("/search", filename="spring", limit=1)["total_found"]
+    spring = city.get("/search", filename="spring", limit=1)["total_found"]
     assert 0 < spring < everything
     expect(page.locator(".total")).to_have_text(f"{spring} photos")
     page.get_by_label("Name").fill("")
     page.get_by_text("More filters").click()
-    some = town.get("/search", role="database", limit=1)["images"][0]
+    some = city.get("/search", role="database", limit=1)["images"][0]
     page.get_by_label("Near").fill(f"{some['latitude']}, {some['longitude']}")
     page.get_by_label("Within metres").fill("30")
-    near = town.get("/search", near=f"{some['latitude']},{some['longitude']},30", limit=1)
+    near = city.get("/search", near=f"{some['latitude']},{some['longitude']},30", limit=1)
     assert 0 < near["total_found"] < everything
     expect(page.locator(".photo-card")).to_have_count(near["total_found"])
     page.get_by_label("Name").fill("no such photo")
@@ -67,11 +67,11 @@ def test_the_map_shows_where_photos_are_and_takes_a_point(visitor: Visitor) -> N
     page.keyboard.press("Enter")
     expect(page.get_by_label("Near")).not_to_have_value("")
     expect(page.locator("path.estimate")).to_have_count(1)
-    visitor.untroubled()
+    visitor.expect_no_error()
 
 
-def test_chosen_photos_are_tagged_and_deleted(visitor: Visitor, town: Town) -> None:
-    ids = bring_in(town, "tagged-one.jpg", "tagged-two.jpg")
+def test_chosen_photos_are_tagged_and_deleted(visitor: Visitor, city: CityServer) -> None:
+    ids = bring_in(city, "tagged-one.jpg", "tagged-two.jpg")
     page = visitor.visit("photos")
     page.get_by_label("Name").fill("tagged-")
     expect(page.locator(".photo-card")).to_have_count(2)
@@ -81,7 +81,7 @@ def test_chosen_photos_are_tagged_and_deleted(visitor: Visitor, town: Town) -> N
     page.get_by_label("Tags to add").fill("second, third")
     page.get_by_role("button", name="Add", exact=True).click()
     expect(page.locator(".photo-card .chips").first).to_contain_text("third")
-    assert town.get(f"/uploads/{ids[0]}")["tags"] == ["first", "second", "third"]
+    assert city.get(f"/uploads/{ids[0]}")["tags"] == ["first", "second", "third"]
 
     page.get_by_role("checkbox").first.check()
     page.get_by_role("button", name="Delete…").click()
@@ -90,14 +90,14 @@ def test_chosen_photos_are_tagged_and_deleted(visitor: Visitor, town: Town) -> N
     page.get_by_role("button", name="Delete…").click()
     page.get_by_role("button", name="Delete", exact=True).click()
     expect(page.locator(".photo-card")).to_have_count(1)
-    assert town.get("/search", filename="tagged-")["total_found"] == 1
+    assert city.get("/search", filename="tagged-")["total_found"] == 1
 
 
 def test_a_photo_is_moved_and_named_and_shows_no_rounding_errors(
-    visitor: Visitor, town: Town
+    visitor: Visitor, city: CityServer
 ) -> None:
-    (photo_id,) = bring_in(town, "moved.jpg")
-    town.server.client.patch(
+    (photo_id,) = bring_in(city, "moved.jpg")
+    city.server.client.patch(
         f"/api/v1/uploads/{photo_id}", params={"map": MAP}, json={"longitude": 8.700000000000001}
     ).raise_for_status()
     page = visitor.visit(f"photo/{photo_id}")
@@ -107,22 +107,22 @@ def test_a_photo_is_moved_and_named_and_shows_no_rounding_errors(
     page.get_by_label("Place").fill("Harbour <b>wall</b>")
     page.get_by_role("button", name="Save").click()
     expect(page.locator(".note")).to_contain_text("Saved.")
-    reported = town.get(f"/uploads/{photo_id}")
+    reported = city.get(f"/uploads/{photo_id}")
     assert (reported["latitude"], reported["place"]) == (44.5, "Harbour <b>wall</b>")
     page.get_by_label("Latitude").fill("")
     page.get_by_role("button", name="Save").click()
     expect(page.locator(".note.bad")).to_be_visible()
-    assert town.get(f"/uploads/{photo_id}")["latitude"] == 44.5
+    assert city.get(f"/uploads/{photo_id}")["latitude"] == 44.5
     visitor.visit("photos")
     page.get_by_label("Name").fill("moved.jpg")
     expect(page.locator(".photo-name").first).to_have_text("Harbour <b>wall</b>")
 
 
-def test_a_photo_is_deleted_from_its_own_page(visitor: Visitor, town: Town) -> None:
-    (photo_id,) = bring_in(town, "gone.jpg")
+def test_a_photo_is_deleted_from_its_own_page(visitor: Visitor, city: CityServer) -> None:
+    (photo_id,) = bring_in(city, "gone.jpg")
     page = visitor.visit(f"photo/{photo_id}")
     page.get_by_role("button", name="Delete…").click()
     page.get_by_role("button", name="Delete", exact=True).click()
     expect(page.get_by_role("heading", name="Photos")).to_be_visible()
-    gone = town.server.client.get(f"/api/v1/uploads/{photo_id}", params={"map": MAP})
+    gone = city.server.client.get(f"/api/v1/uploads/{photo_id}", params={"map": MAP})
     assert gone.status_code == 404

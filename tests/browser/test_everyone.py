@@ -8,24 +8,24 @@ import pytest
 from axe_core_python.sync_playwright import Axe
 from playwright.sync_api import Page, expect
 
-from tests.browser.conftest import Town, Visitor
+from tests.browser.conftest import CityServer, Visitor
 
 VIEWS = ["ask", "answer", "compare", "photos", "photo", "tracks", "track"]
 VIEWS += ["add", "locate", "model", "status"]
 SERIOUS = {"serious", "critical"}
 
 
-def open_view(visitor: Visitor, town: Town, view: str) -> Page:
+def open_view(visitor: Visitor, city: CityServer, view: str) -> Page:
     if view == "photo":
-        stored = town.get("/search", role="database", limit=1)["images"][0]
+        stored = city.get("/search", role="database", limit=1)["images"][0]
         page = visitor.visit(f"photo/{stored['image_id']}")
         expect(page.locator("path.point")).to_be_attached()
     elif view == "track":
-        page = visitor.visit(f"tracks/{town.ride()}")
+        page = visitor.visit(f"tracks/{city.ride()}")
         expect(page.locator("path.point.tracking").first).to_be_attached()
     elif view in ("answer", "compare"):
         page = visitor.visit("ask")
-        page.locator("input[data-use=ask]").set_input_files(town.queries[0])
+        page.locator("input[data-use=ask]").set_input_files(city.queries[0])
         expect(page.locator(".number-pin").first).to_be_visible()
         if view == "compare":
             page.locator(".match").first.click()
@@ -41,10 +41,10 @@ def open_view(visitor: Visitor, town: Town, view: str) -> Page:
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("view", VIEWS)
 def test_no_view_has_a_serious_accessibility_fault(
-    visitor: Visitor, town: Town, view: str, scheme: Any
+    visitor: Visitor, city: CityServer, view: str, scheme: Any
 ) -> None:
     visitor.page.emulate_media(color_scheme=scheme)
-    page = open_view(visitor, town, view)
+    page = open_view(visitor, city, view)
     faults = [
         f"{fault['id']}: {node['html'][:200]} {node['failureSummary']}"
         for fault in Axe().run(page)["violations"]
@@ -55,9 +55,11 @@ def test_no_view_has_a_serious_accessibility_fault(
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_no_view_is_wider_than_a_narrow_phone(visitor: Visitor, town: Town, view: str) -> None:
+def test_no_view_is_wider_than_a_narrow_phone(
+    visitor: Visitor, city: CityServer, view: str
+) -> None:
     visitor.page.set_viewport_size({"width": 320, "height": 640})
-    page = open_view(visitor, town, view)
+    page = open_view(visitor, city, view)
     assert page.evaluate("document.documentElement.scrollWidth") <= 320
 
 
@@ -68,8 +70,8 @@ def focused(page: Page) -> str:
     return name.strip()
 
 
-def test_a_match_is_reached_by_keyboard_alone(visitor: Visitor, town: Town) -> None:
-    stored = town.get("/search", role="database", limit=1)["images"][0]
+def test_a_match_is_reached_by_keyboard_alone(visitor: Visitor, city: CityServer) -> None:
+    stored = city.get("/search", role="database", limit=1)["images"][0]
     page = visitor.visit(f"ask/{stored['image_id']}")
     expect(page.locator(".match")).to_have_count(12)
     page.locator(".skip").press("Enter")

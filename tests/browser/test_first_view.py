@@ -7,12 +7,12 @@ from typing import Any
 import pytest
 from playwright.sync_api import BrowserContext, expect
 
-from tests.browser.conftest import Town, Visitor
+from tests.browser.conftest import CityServer, Visitor
 
 MOST_BYTES = 300_000
 
 
-def test_the_first_view_is_small(context: BrowserContext, visitor: Visitor) -> None:
+def test_the_first_view_loads_few_bytes(context: BrowserContext, visitor: Visitor) -> None:
     received: list[float] = []
     network = context.new_cdp_session(visitor.page)
     network.send("Network.enable")
@@ -26,13 +26,13 @@ def test_the_first_view_is_small(context: BrowserContext, visitor: Visitor) -> N
 
 @pytest.mark.parametrize("path", ["/docs", "/redoc"])
 def test_the_api_is_described_without_any_other_server(
-    context: BrowserContext, town: Town, path: str
+    context: BrowserContext, city: CityServer, path: str
 ) -> None:
     answered: list[Any] = []
     context.on("requestfinished", lambda request: answered.append(request.url))
     page = context.new_page()
-    page.goto(town.url + path)
+    page.goto(city.url + path)
     expect(page.get_by_text("/api/v1/similarity/{file_id}").first).to_be_visible()
     # ReDoc would show its maker's mark; the page's policy keeps that request from leaving.
-    elsewhere = [url for url in answered if not url.startswith((town.url, "blob:", "data:"))]
+    elsewhere = [url for url in answered if not url.startswith((city.url, "blob:", "data:"))]
     assert elsewhere == []

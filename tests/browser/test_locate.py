@@ -11,7 +11,7 @@ from PIL.ExifTags import GPS, IFD, Base
 from playwright.sync_api import expect
 
 from shared.ingest.photo_metadata import read_csv_manifest
-from tests.browser.conftest import Town, Visitor
+from tests.browser.conftest import CityServer, Visitor
 from tests.support.photos import photo_bytes
 
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
@@ -36,17 +36,17 @@ def take_photo(
 
 
 def test_a_folder_is_located_accepted_by_probability_and_downloaded(
-    visitor: Visitor, town: Town, tmp_path: Path
+    visitor: Visitor, city: CityServer, tmp_path: Path
 ) -> None:
-    stored = town.get("/search", role="database", limit=1)["images"][0]
+    stored = city.get("/search", role="database", limit=1)["images"][0]
     picture = tmp_path / "stored.jpg"
-    picture.write_bytes(town.server.client.get(stored["image_url"]).content)
+    picture.write_bytes(city.server.client.get(stored["image_url"]).content)
     position = (stored["latitude"], stored["longitude"])
     folder = tmp_path / "trip"
     folder.mkdir()
     take_photo(picture, folder / "known.jpg", 0, position)
     take_photo(picture, folder / "soon.jpg", 5, None)
-    take_photo(town.queries[0], folder / "much later.jpg", 7200, None)
+    take_photo(city.queries[0], folder / "much later.jpg", 7200, None)
     (folder / "broken.jpg").write_bytes((folder / "soon.jpg").read_bytes()[:100])
     (folder / "empty.jpg").touch()
 
@@ -79,11 +79,11 @@ def test_a_folder_is_located_accepted_by_probability_and_downloaded(
     page.get_by_label("Accept from").blur()
     expect(page.get_by_role("button", name="Download CSV")).to_have_count(0)
     expect(page.get_by_text("4 photos without coordinates, 0 accepted").first).to_be_visible()
-    visitor.untroubled()
+    visitor.expect_no_error()
 
 
 def test_the_time_zone_and_the_error_of_the_clock_move_a_photo_along_the_track(
-    visitor: Visitor, town: Town, tmp_path: Path
+    visitor: Visitor, city: CityServer, tmp_path: Path
 ) -> None:
     nowhere = tmp_path / "nowhere.png"
     nowhere.write_bytes(photo_bytes(5, "PNG"))
@@ -100,7 +100,7 @@ def test_the_time_zone_and_the_error_of_the_clock_move_a_photo_along_the_track(
     page.get_by_label("The clock was ahead by").fill("-3600")
     page.get_by_label("The clock was ahead by").blur()
     expect(photo).to_contain_text("45.00000, 7.11000")
-    visitor.untroubled()
+    visitor.expect_no_error()
 
 
 TRACK = (

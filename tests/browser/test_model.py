@@ -7,12 +7,12 @@ from pathlib import Path
 
 from playwright.sync_api import Route, expect
 
-from tests.browser.conftest import MAP, Town, Visitor
+from tests.browser.conftest import MAP, CityServer, Visitor
 from tests.support.exported import SIDE, onnx_of, tiny_network
 
 
 def test_a_vocabulary_is_fitted_with_a_bar_and_compared_with_the_one_before(
-    visitor: Visitor, town: Town
+    visitor: Visitor, city: CityServer
 ) -> None:
     page = visitor.visit("model")
     expect(page.locator(".standing .chip")).to_have_text("Foreign")
@@ -21,24 +21,24 @@ def test_a_vocabulary_is_fitted_with_a_bar_and_compared_with_the_one_before(
     page.get_by_role("button", name="Fit it", exact=True).click()
     expect(page.get_by_role("progressbar", name="Improving the map")).to_be_visible()
     expect(page.locator(".standing .chip")).to_have_text("Its own")
-    assert town.get(f"/maps/{MAP}")["vocabulary"] == "own"
+    assert city.get(f"/maps/{MAP}")["vocabulary"] == "own"
 
     page.get_by_role("button", name="Measure now").click()
     expect(page.get_by_role("heading", name="Before and after")).to_be_visible()
     before, after = reversed(
-        [one["figures"]["leave_one_out"]["R@1"] for one in _newest_of_each(town)]
+        [one["figures"]["leave_one_out"]["R@1"] for one in _newest_of_each(city)]
     )
     shown = page.locator("table.recalls").last.locator("tbody tr").first
     expect(shown.locator("td").nth(0)).to_contain_text(f"{100 * before:.1f} %")
     expect(shown.locator("td").nth(1)).to_contain_text(f"{100 * after:.1f} %")
-    vocabularies = town.get("/vocabularies")
+    vocabularies = city.get("/vocabularies")
     with page.expect_download() as download:
         page.get_by_role("button", name="Download").first.click()
     assert download.value.suggested_filename == f"{vocabularies[0]['vocabulary_id']}.npz"
 
 
-def test_every_view_says_that_the_map_is_being_improved(visitor: Visitor, town: Town) -> None:
-    finished = town.get("/jobs", kind="evaluate", limit=1)["jobs"][0]
+def test_every_view_says_that_the_map_is_being_improved(visitor: Visitor, city: CityServer) -> None:
+    finished = city.get("/jobs", kind="evaluate", limit=1)["jobs"][0]
     fit = {**finished, "kind": "fit", "label": "Improving the map", "state": "running"}
     fit |= {"stage": "describe", "progress": {"done": 40, "total": 100, "failed": 0}}
     visitor.page.route(
@@ -51,7 +51,7 @@ def test_every_view_says_that_the_map_is_being_improved(visitor: Visitor, town: 
     expect(visitor.page.get_by_role("heading", name="Model in use")).to_be_visible()
 
 
-def test_automatic_fits_are_switched_on_and_off(visitor: Visitor, town: Town) -> None:
+def test_automatic_fits_are_switched_on_and_off(visitor: Visitor, city: CityServer) -> None:
     page = visitor.visit("model")
     switch = page.get_by_role("checkbox", name="Improve this map automatically")
     expect(switch).not_to_be_checked()
@@ -61,15 +61,15 @@ def test_automatic_fits_are_switched_on_and_off(visitor: Visitor, town: Town) ->
     expect(next_fit).to_be_visible()
     switch.uncheck()
     expect(next_fit).to_have_count(0)
-    assert town.get("/maps/default")["auto_fit"] is False
+    assert city.get("/maps/default")["auto_fit"] is False
     switch.check()
     expect(next_fit).to_be_visible()
-    assert town.get("/maps/default")["auto_fit"] is True
+    assert city.get("/maps/default")["auto_fit"] is True
 
 
-def _newest_of_each(town: Town) -> list[dict[str, dict[str, dict[str, float]]]]:
+def _newest_of_each(city: CityServer) -> list[dict[str, dict[str, dict[str, float]]]]:
     newest: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
-    for one in town.get("/evaluations")["evaluations"]:
+    for one in city.get("/evaluations")["evaluations"]:
         newest.setdefault(one["generation_id"], one)
     assert len(newest) == 2
     return list(newest.values())
@@ -103,7 +103,9 @@ def test_a_comparison_stays_on_a_narrow_phone(visitor: Visitor) -> None:
     assert page.evaluate("document.documentElement.scrollWidth") <= 320
 
 
-def test_labels_can_be_set_to_names_and_back_to_automatic(visitor: Visitor, town: Town) -> None:
+def test_labels_can_be_set_to_names_and_back_to_automatic(
+    visitor: Visitor, city: CityServer
+) -> None:
     page = visitor.visit("model")
     labels = page.get_by_label("Labels")
     expect(labels).to_have_value("auto")
@@ -111,16 +113,32 @@ def test_labels_can_be_set_to_names_and_back_to_automatic(visitor: Visitor, town
         labels.select_option(value)
         expect(page.locator(".note").first).to_contain_text("Saved.")
         page.locator(".note button").first.click()
-        described = town.get(f"/maps/{MAP}")
+        described = city.get(f"/maps/{MAP}")
         assert described["place_labels_are_automatic"] is automatic
         assert described["place_labels_are_paths"] is False
 
 
-def test_status_shows_the_parts_the_map_and_the_newest_jobs(visitor: Visitor, town: Town) -> None:
+def test_the_share_of_queries_from_elsewhere_is_set_in_percent(
+    visitor: Visitor, city: CityServer
+) -> None:
+    page = visitor.visit("model")
+    share = page.get_by_label("Queries from elsewhere")
+    expect(share).to_have_value("33")
+    for percent in (5, 33):
+        share.fill(str(percent))
+        share.press("Enter")
+        expect(page.locator(".note").first).to_contain_text("Saved.")
+        page.locator(".note button").first.click()
+        assert city.get(f"/maps/{MAP}")["elsewhere"] == percent / 100
+
+
+def test_status_shows_the_parts_the_map_and_the_newest_jobs(
+    visitor: Visitor, city: CityServer
+) -> None:
     page = visitor.visit("status")
     expect(page.locator(".parts li")).to_have_count(6)
     expect(page.locator(".card .chip.healthy")).to_have_text("healthy")
-    photos = town.get("/database/stats")["total_images"]
+    photos = city.get("/database/stats")["total_images"]
     expect(page.locator(".tile").first).to_contain_text(str(photos))
     expect(page.get_by_text("The certainty of answers is measured.")).to_be_visible()
     expect(page.get_by_role("heading", name="Newest jobs")).to_be_visible()
@@ -128,10 +146,10 @@ def test_status_shows_the_parts_the_map_and_the_newest_jobs(visitor: Visitor, to
 
 
 def test_a_question_in_the_history_has_the_title_of_its_answer(
-    visitor: Visitor, town: Town
+    visitor: Visitor, city: CityServer
 ) -> None:
-    town.ask(town.queries[0])
-    entry = town.get("/searches?limit=1")["searches"][0]
+    city.ask(city.queries[0])
+    entry = city.get("/searches?limit=1")["searches"][0]
     titles = {
         (True, 1, 0.02, True): "In this map",
         (False, None, 0.7, False): "Not in this map",
@@ -165,26 +183,26 @@ def test_a_phone_gets_the_address_as_a_code_where_it_can_reach_the_server(
     assert code.evaluate("(image) => image.decode().then(() => image.naturalWidth)") > 100
 
 
-def test_a_new_map_is_created_and_selected(visitor: Visitor, town: Town) -> None:
+def test_a_new_map_is_created_and_selected(visitor: Visitor, city: CityServer) -> None:
     page = visitor.visit("photos")
     page.locator("#map-choice").select_option(label="New map…")
-    page.get_by_label("Name").last.fill("old-town")
+    page.get_by_label("Name").last.fill("old-city")
     page.get_by_role("button", name="Create").click()
     expect(page.get_by_role("heading", name="This map has no photos yet")).to_be_visible()
-    expect(page.locator("#map-choice")).to_have_value("old-town")
-    assert "old-town" in [one["name"] for one in town.server.client.get("/api/v1/maps").json()]
+    expect(page.locator("#map-choice")).to_have_value("old-city")
+    assert "old-city" in [one["name"] for one in city.server.client.get("/api/v1/maps").json()]
 
 
 def test_added_models_are_listed_and_can_be_switched_to(
-    visitor: Visitor, town: Town, tmp_path: Path
+    visitor: Visitor, city: CityServer, tmp_path: Path
 ) -> None:
     file = onnx_of(tiny_network(), tmp_path)
     options = f"input.size={SIDE}x{SIDE}"
     form = {"name": "tiny", "licence": "MIT", "options": options}
-    started = town.server.client.post(
+    started = city.server.client.post(
         "/api/v1/models", data=form, files={"file": ("net.onnx", file)}
     )
-    finished = town.server.finished(started.json()["job_id"])
+    finished = city.server.finished(started.json()["job_id"])
     assert finished["state"] == "succeeded", finished
     page = visitor.visit("model")
     row = page.get_by_role("group", name="Added models").locator("tbody tr")
@@ -198,4 +216,4 @@ def test_added_models_are_listed_and_can_be_switched_to(
     with page.expect_request("**/api/v1/generations*") as sent:
         row.get_by_role("button", name="Switch to it").click()
     assert sent.value.post_data_json == {"extractor": f"onnx:tiny:{options}"}
-    assert town.server.client.delete("/api/v1/models/tiny").is_success
+    assert city.server.client.delete("/api/v1/models/tiny").is_success

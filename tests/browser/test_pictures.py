@@ -6,7 +6,7 @@ from pathlib import Path
 
 from playwright.sync_api import FilePayload, Page, expect
 
-from tests.browser.conftest import MAP, Town, Visitor
+from tests.browser.conftest import MAP, CityServer, Visitor
 
 MOST_BYTES = 300_000
 LOADED = """() => [...document.images].filter((image) =>
@@ -25,26 +25,26 @@ def take(page: Page, path: Path) -> None:
     assert path.stat().st_size < MOST_BYTES
 
 
-def learn(town: Town) -> None:
+def learn(city: CityServer) -> None:
     """A vocabulary of the map's own, measured."""
-    if town.get(f"/maps/{MAP}")["vocabulary"] != "own":
-        town.work("/vocabularies")
-    town.work("/evaluations")
+    if city.get(f"/maps/{MAP}")["vocabulary"] != "own":
+        city.work("/vocabularies")
+    city.work("/evaluations")
 
 
-def best_known(town: Town) -> Path:
+def best_known(city: CityServer) -> Path:
     """A query that the map knows, and of these the one with the most similar match."""
 
     def likeness(photo: Path) -> tuple[bool, float]:
-        found = town.ask(photo)
+        found = city.ask(photo)
         return bool(found["estimate"]["in_map"]), found["similar_images"][0]["similarity_score"]
 
-    return max(town.queries, key=likeness)
+    return max(city.queries, key=likeness)
 
 
-def test_pictures_are_taken(visitor: Visitor, town: Town, pictures: Path) -> None:
-    learn(town)
-    query = best_known(town)
+def test_pictures_are_taken(visitor: Visitor, city: CityServer, pictures: Path) -> None:
+    learn(city)
+    query = best_known(city)
     data: FilePayload = {
         "name": "a-walk.jpg",
         "mimeType": "image/jpeg",
@@ -74,7 +74,7 @@ def test_pictures_are_taken(visitor: Visitor, town: Town, pictures: Path) -> Non
     page.get_by_text("More filters").click()
     page.get_by_role("button", name="Show the map").click()
     expect(page.locator("path.point").first).to_be_attached()
-    visitor.untroubled()
+    visitor.expect_no_error()
     take(page, pictures / "photos.jpg")
     visitor.visit("model")
     take(page, pictures / "model.jpg")

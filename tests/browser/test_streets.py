@@ -9,7 +9,7 @@ from PIL import Image
 from playwright.sync_api import BrowserContext, Page, Route, expect
 
 from shared.config.gateway_settings import OPENSTREETMAP_ATTRIBUTION
-from tests.browser.conftest import Town, Visitor
+from tests.browser.conftest import CityServer, Visitor
 
 TILES = "https://tile.openstreetmap.org/"
 
@@ -21,22 +21,22 @@ def tile(route: Route) -> None:
 
 
 @pytest.fixture
-def visiting(context: BrowserContext, town: Town) -> Visitor:
+def visiting(context: BrowserContext, city: CityServer) -> Visitor:
     context.route(TILES + "**", tile)
-    return Visitor(context, town.url)
+    return Visitor(context, city.url)
 
 
-def open_map(visiting: Visitor, town: Town) -> Page:
-    stored = town.get("/search", role="database", limit=1)["images"][0]
+def open_map(visiting: Visitor, city: CityServer) -> Page:
+    stored = city.get("/search", role="database", limit=1)["images"][0]
     page = visiting.visit(f"photo/{stored['image_id']}")
     expect(page.locator("path.point")).to_be_attached()
     return page
 
 
 def test_streets_are_loaded_once_the_visitor_agrees_and_until_they_are_hidden(
-    visiting: Visitor, town: Town
+    visiting: Visitor, city: CityServer
 ) -> None:
-    page = open_map(visiting, town)
+    page = open_map(visiting, city)
     streets = page.get_by_role("button", name="Streets")
     streets.click()
     expect(page.get_by_role("dialog")).to_contain_text("tile.openstreetmap.org")
@@ -53,12 +53,12 @@ def test_streets_are_loaded_once_the_visitor_agrees_and_until_they_are_hidden(
     assert visiting.foreign
     assert all(url.startswith(TILES) for url in visiting.foreign)
 
-    page = open_map(visiting, town)
+    page = open_map(visiting, city)
     expect(page.locator(".leaflet-tile-loaded").first).to_be_visible()
     page.get_by_role("button", name="Streets").click()
     expect(page.locator(".graticule-label").first).to_be_visible()
     loaded = len(visiting.foreign)
-    page = open_map(visiting, town)
+    page = open_map(visiting, city)
     page.wait_for_load_state("networkidle")
     expect(page.locator(".leaflet-tile")).to_have_count(0)
     assert len(visiting.foreign) == loaded
@@ -66,10 +66,10 @@ def test_streets_are_loaded_once_the_visitor_agrees_and_until_they_are_hidden(
 
 
 def test_the_graticule_stays_where_no_streets_can_be_loaded(
-    context: BrowserContext, town: Town
+    context: BrowserContext, city: CityServer
 ) -> None:
     context.route(TILES + "**", lambda route: route.abort())
-    page = open_map(Visitor(context, town.url), town)
+    page = open_map(Visitor(context, city.url), city)
     page.get_by_role("button", name="Streets").click()
     page.get_by_role("button", name="Load streets").click()
     expect(page.locator(".note.bad")).to_contain_text("be loaded from tile.openstreetmap.org")
@@ -78,9 +78,9 @@ def test_the_graticule_stays_where_no_streets_can_be_loaded(
 
 
 def test_the_policy_lets_images_of_the_tile_server_through_and_nothing_else(
-    visiting: Visitor, town: Town
+    visiting: Visitor, city: CityServer
 ) -> None:
-    page = open_map(visiting, town)
+    page = open_map(visiting, city)
     attempt = "(url) => fetch(url).then(() => 'loaded', () => 'refused')"
     assert page.evaluate(attempt, TILES + "0/0/0.png") == "refused"
     image = """(url) => new Promise((resolve) => {
@@ -94,11 +94,11 @@ def test_the_policy_lets_images_of_the_tile_server_through_and_nothing_else(
 
 
 def test_coordinates_are_copied_and_opened_in_openstreetmap(
-    visitor: Visitor, town: Town, context: BrowserContext
+    visitor: Visitor, city: CityServer, context: BrowserContext
 ) -> None:
     context.grant_permissions(["clipboard-read", "clipboard-write"])
-    stored = town.get("/search", role="database", limit=1)["images"][0]
-    page = open_map(visitor, town)
+    stored = city.get("/search", role="database", limit=1)["images"][0]
+    page = open_map(visitor, city)
     page.get_by_role("button", name="Copy").click()
     expected = f"{stored['latitude']:.5f}, {stored['longitude']:.5f}"
     expect(page.locator(".note")).to_contain_text(expected)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from playwright.sync_api import expect
 
-from tests.browser.conftest import Town, Visitor
+from tests.browser.conftest import CityServer, Visitor
 
 
-def test_a_track_is_listed_drawn_and_deleted(visitor: Visitor, town: Town) -> None:
-    track_id = town.ride()
+def test_a_track_is_listed_drawn_and_deleted(visitor: Visitor, city: CityServer) -> None:
+    track_id = city.ride()
     page = visitor.visit("tracks")
     with page.expect_response(lambda response: "smoothed=true" in response.url):
         page.locator(f"a[href='#/tracks/{track_id}']").click()
@@ -24,5 +24,5 @@ def test_a_track_is_listed_drawn_and_deleted(visitor: Visitor, town: Town) -> No
     page.get_by_role("button", name="Delete", exact=True).click()
     expect(page.get_by_role("heading", name="Tracks", exact=True)).to_be_visible()
     expect(page.locator(f"a[href='#/tracks/{track_id}']")).to_have_count(0)
-    assert track_id not in {track["track_id"] for track in town.get("/tracks")["tracks"]}
-    visitor.untroubled()
+    assert track_id not in {track["track_id"] for track in city.get("/tracks")["tracks"]}
+    visitor.expect_no_error()

@@ -28,7 +28,7 @@ def checkout(tmp_path: Path) -> Path:
 
 def test_make_run_installs_what_running_needs_and_make_test_everything(checkout: Path) -> None:
     to_run, to_test = make(checkout, "run"), make(checkout, "test")
-    extras = "--editable '.[embedded,exif,heic,onnx,pose,tracks]'"
+    extras = "--editable '.[embedded,heic,onnx,pose,tracks]'"
     assert extras in to_run
     assert "--all-extras" not in to_run
     assert to_test.index(extras) < to_test.index("--all-extras")

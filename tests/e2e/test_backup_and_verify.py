@@ -10,8 +10,6 @@ from tests.support.metrics import read
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess, environment, run_command
 
-SETTINGS = {"log_format": "json"}
-
 
 def run(server_or_home: Path, *arguments: str | Path, code: int = 0) -> Any:
     done = run_command(
@@ -75,24 +73,6 @@ def test_one_scrape_of_the_embedded_server_has_metrics_of_all_its_parts(
     assert text["placewise_search_rows"][()] > 0
     assert text["placewise_steward_tasks_total"][(("outcome", "done"), ("task", "reclaim_leases"))]
     assert text["placewise_gateway_catalog_up"][()] == 1
-
-
-def test_every_line_of_the_log_is_json_and_the_id_of_an_upload_is_in_several(
-    server: ServerProcess,
-) -> None:
-    answer = server.client.post(
-        "/api/v1/upload",
-        files={"file": ("photo.jpg", photo_bytes(30))},
-        headers={"X-Request-ID": "an-id-of-mine"},
-    )
-    job = server.finished(answer.json()["job_id"])
-    assert job["request_id"] == "an-id-of-mine"
-    text = server.log_path.read_text().splitlines()
-    lines = [json.loads(line) for line in text if line.startswith("{")]
-    # What `placewise serve` says to its user at the start is no log.
-    assert len(lines) > len(text) / 2
-    loggers = {line["logger"] for line in lines if "an-id-of-mine" in json.dumps(line)}
-    assert loggers >= {"services.request_log", "services.extractor.publish"}
 
 
 def test_what_is_not_there_can_neither_be_backed_up_nor_verified(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,11 +12,9 @@ import pytest
 
 from placewise.client import Client
 from shared.errors import InvalidRequest
-from tests.e2e.test_separate_services import Deployment, until
 from tests.support.archives import zip_of
 from tests.support.photos import photo_bytes
 from tests.support.server import CommandLine, ServerProcess
-from tests.support.servers import PostgresServer, S3Server, start_redis
 
 SETTINGS = {"max_file_size": 100_000}
 
@@ -29,15 +26,6 @@ def photos(*numbers: int) -> dict[str, bytes]:
 def table(*numbers: int) -> bytes:
     rows = (f"{number}.jpg,{45 + number / 1000},7\n" for number in numbers)
     return ("filename,latitude,longitude\n" + "".join(rows)).encode()
-
-
-def form(*numbers: int) -> list[tuple[str, Any]]:
-    """The form of a batch of these photos, with a manifest of their coordinates."""
-    manifest = "\n".join(
-        json.dumps({"filename": f"{number}.jpg", "latitude": 45 + number / 1000, "longitude": 7})
-        for number in numbers
-    )
-    return [("manifest", ("m", manifest)), *(("file", one) for one in photos(*numbers).items())]
 
 
 @pytest.fixture
@@ -74,21 +62,6 @@ def test_the_client_sends_files_with_a_manifest_and_names_of_objects(
         client.import_objects([{"key": "originals/a.jpg"}])
 
 
-def test_a_manifest_of_more_than_a_megabyte_is_read(server: ServerProcess) -> None:
-    lines = b"".join(b'{"key": "imports/%064d.jpg"}\n' % number for number in range(15_000))
-    assert len(lines) > 1_000_000
-    answer = server.client.post(
-        "/api/v1/upload/batch",
-        content=lines,
-        headers={"Content-Type": "application/x-ndjson"},
-    )
-    assert answer.status_code == 202, answer.text
-    job_id = answer.json()["job_id"]
-    assert server.client.get(f"/api/v1/jobs/{job_id}").json()["progress"]["total"] == 15_000
-    cancelled = server.client.post(f"/api/v1/jobs/{job_id}/cancel").json()
-    assert cancelled["state"] == "cancelled"
-
-
 def index(server: ServerProcess, path: Path, *options: str, code: int = 0) -> dict[str, Any]:
     run = CommandLine(path.parent, server.home)("index", path, *options, "--json")
     report: dict[str, Any] = run.json(code)
@@ -118,7 +91,7 @@ def test_index_takes_an_archive_as_it_takes_a_folder(server: ServerProcess, tmp_
     assert sorted(each.name for each in tmp_path.iterdir()) == ["journal.jsonl", "photos"]
 
 
-def test_index_takes_a_list_goes_on_after_a_break_and_writes_what_failed(
+def test_index_takes_a_list_goes_on_after_a_break_and_names_what_failed(
     server: ServerProcess, tmp_path: Path
 ) -> None:
     for name, data in photos(170, 171).items():
@@ -128,13 +101,12 @@ def test_index_takes_a_list_goes_on_after_a_break_and_writes_what_failed(
     names = ("170.jpg", "171.jpg", "bad.jpg")
     lines = [json.dumps({"filename": name, "place": "hall"}) for name in names]
     listed.write_text("\n".join(lines))
-    journal, failures = tmp_path / "journal.jsonl", tmp_path / "failures.jsonl"
-    options = ("--journal", str(journal), "--failures", str(failures))
+    journal = tmp_path / "journal.jsonl"
+    options = ("--journal", str(journal))
     report = index(server, listed, *options, code=1)
-    assert (report["uploaded"], len(report["refused"])) == (2, 1)
-    [failure] = [json.loads(line) for line in failures.read_text().splitlines()]
-    assert failure["outcome"] == "refused"
-    assert failure["path"].endswith("bad.jpg")
+    assert report["uploaded"] == 2
+    [refused] = report["refused"]
+    assert refused["path"].endswith("bad.jpg")
     found = server.ask(photo_bytes(171), top_k=1).json()["similar_images"][0]
     assert found["place"] == "hall"
 
@@ -143,7 +115,6 @@ def test_index_takes_a_list_goes_on_after_a_break_and_writes_what_failed(
     report = index(server, listed, *options)
     assert (report["uploaded"], report["already_there"]) == (0, 2)
     assert len(journal.read_text().splitlines()) == 3
-    assert failures.read_text() == ""
 
 
 def test_index_brings_in_a_list_of_keys(server: ServerProcess, tmp_path: Path) -> None:
@@ -181,38 +152,3 @@ def test_export_writes_what_other_programs_read(server: ServerProcess, tmp_path:
     lines = (tmp_path / "pairs.txt").read_text().splitlines()
     assert len(lines) == pairs["pairs"] > 0
     assert all(len(set(line.split())) == 2 for line in lines)
-
-
-def test_a_batch_in_separate_services_outlives_its_steward(
-    tmp_path: Path, postgres: PostgresServer, s3: S3Server
-) -> None:
-    bucket = s3.new_bucket()
-    count = 60
-    with start_redis(own=True) as redis:
-        deployment = Deployment(tmp_path, postgres.new_database(), redis.url)
-        try:
-            deployment.settings |= s3.variables(bucket.name) | {"batch_photos": 1}
-            deployment.migrate()
-            deployment.start("search")
-            deployment.settings["search_urls"] = deployment.address("search", 0)
-            deployment.start("gateway")
-            deployment.start("extractor")
-            steward = deployment.start("steward")
-            with deployment.client(1) as client:
-                until(lambda: client.get("/readyz").is_success)
-                answer = client.post("/api/v1/upload/batch", files=form(*range(count)))
-                assert answer.status_code == 202, answer.text
-                job_url = answer.json()["status_url"]
-                until(lambda: client.get(job_url).json()["progress"]["done"] >= 10)
-                steward.send_signal(signal.SIGKILL)
-                steward.wait()
-                deployment.start("steward")
-                until(lambda: client.get(job_url).json()["state"] == "succeeded")
-                job = client.get(job_url).json()
-                assert job["progress"] == {"done": count, "total": count, "failed": 0}
-                assert job["result"]["already_there"] == 0
-                stats = client.get("/api/v1/database/stats").json()
-                assert (stats["total_images"], stats["searchable_images"]) == (count, count)
-            assert "Traceback" not in deployment.logs()
-        finally:
-            deployment.close()

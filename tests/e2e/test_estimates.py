@@ -12,9 +12,8 @@ import pytest
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess
 
-AUTOMATIC = 64  # located photos from which a map is evaluated by itself
-SETTINGS = {"auto_evaluate_photos": AUTOMATIC}
-ENOUGH = 60  # to tell one in twenty, and not evaluated by itself
+SETTINGS = {"auto_evaluate_photos": 0}
+ENOUGH = 60  # to tell one in twenty
 MANY = 60  # more than an estimate looks at
 fresh = itertools.count(9000)
 
@@ -53,13 +52,9 @@ def ask(server: ServerProcess, name: str, data: bytes, **params: Any) -> dict[st
 
 def evaluate(server: ServerProcess, name: str) -> dict[str, Any]:
     started = got(server.client.post("/api/v1/evaluations", params={"map": name}), 202)
-    while True:
-        job: dict[str, Any] = got(
-            server.client.get(f"/api/v1/jobs/{started['job_id']}", params={"map": name, "wait": 30})
-        )
-        if job["state"] not in ("queued", "running"):
-            assert job["state"] == "succeeded", job
-            return job
+    job = server.finished(started["job_id"], map=name)
+    assert job["state"] == "succeeded", job
+    return job
 
 
 @pytest.fixture(scope="module")
@@ -197,18 +192,3 @@ def test_more_photos_than_an_estimate_looks_at_are_answered(server: ServerProces
     none = ask(server, "many", photo_bytes(next(fresh)), min_score=1)
     assert none["similar_images"] == []
     assert "look like it have no coordinates" in none["estimate"]["reason"]
-
-
-def test_a_map_that_has_grown_is_evaluated_by_itself(server: ServerProcess) -> None:
-    numbers = [next(fresh) for _ in range(AUTOMATIC)]
-    fill(server, "grown", numbers, *({"latitude": 1, "longitude": n} for n in range(AUTOMATIC)))
-    deadline = time.monotonic() + 60
-    found: list[Any] = []
-    while not found:
-        assert time.monotonic() < deadline, "no evaluation came"
-        time.sleep(0.05)
-        found = got(server.client.get("/api/v1/evaluations", params={"map": "grown"}))[
-            "evaluations"
-        ]
-    assert found[0]["automatic"]
-    assert ask(server, "grown", re_encoded(numbers[1]))["estimate"]["levels"]

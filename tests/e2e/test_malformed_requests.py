@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from pathlib import Path
 
 import pytest
 
@@ -67,16 +66,6 @@ def test_probes_may_ask_for_the_head_alone(server: ServerProcess) -> None:
     for path in ("/", "/livez", "/readyz", "/api/v1/health"):
         answer = server.client.head(path)
         assert (answer.status_code, answer.content) == (200, b""), path
-
-
-def test_doctor_writes_nothing(tmp_path: Path) -> None:
-    from services.cli.operations.installation_checks import _check_catalog_file, _check_home
-    from shared.config.settings import Settings
-
-    settings = Settings(placewise_home=tmp_path / "not" / "there")
-    assert "can be created" in _check_home(settings)
-    assert "nothing is stored" in _check_catalog_file(settings)
-    assert not (tmp_path / "not").exists()
 
 
 @pytest.mark.parametrize("item", ["{}", "[]", "1", '""', '{"":0}'])

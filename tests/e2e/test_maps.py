@@ -57,15 +57,6 @@ def store(server: ServerProcess, name: str, *numbers: int, **fields: Any) -> lis
     return found
 
 
-def ended(server: ServerProcess, name: str, job_id: str) -> dict[str, Any]:
-    while True:
-        job: dict[str, Any] = got(
-            server.client.get(f"/api/v1/jobs/{job_id}", params={"map": name, "wait": 30})
-        )
-        if job["state"] not in ("queued", "running"):
-            return job
-
-
 # --- made, listed, refused -------------------------------------------------------------------
 
 
@@ -186,7 +177,7 @@ def test_lists_and_statistics_are_those_of_their_map(server: ServerProcess) -> N
     store(server, other, next(fresh))
     got(server.similar(here, map=one))
     job_id = got(server.client.post("/api/v1/evaluations", params={"map": one}), 202)["job_id"]
-    assert ended(server, one, job_id)["state"] == "succeeded"
+    assert server.finished(job_id, map=one)["state"] == "succeeded"
 
     def lengths(name: str) -> list[int]:
         return [

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import httpx2
-import pytest
 
 from shared.config.embedded_home import server_address_file
 from tests.support.photos import photo_bytes
@@ -133,22 +132,6 @@ def test_an_address_in_use_is_refused(server: ServerProcess, tmp_path: Path) -> 
     reported = refused_start(tmp_path / "another", port=port)
     assert reported.startswith("address_in_use: ")
     assert f"127.0.0.1:{port}" in reported
-
-
-@pytest.mark.parametrize(
-    ("settings", "code", "named"),
-    [
-        ({"extractor": "anylock-vitg14"}, "bad_setting", "efficientnet-lite0-vlad"),
-        ({"allow_test_extractors": False}, "bad_setting", "test-tiny-avg"),
-        ({"port": "http"}, "bad_setting", "PORT"),
-    ],
-)
-def test_settings_that_can_not_work_are_refused_at_the_start(
-    tmp_path: Path, settings: dict[str, Any], code: str, named: str
-) -> None:
-    reported = refused_start(tmp_path / "home", **settings)
-    assert reported.startswith(f"{code}: ")
-    assert named in reported
 
 
 # --- its end, and the next start -------------------------------------------------------------

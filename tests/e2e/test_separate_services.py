@@ -13,11 +13,10 @@ from typing import Any
 import httpx2
 import pytest
 
-from tests.support.checkpoints import some_checkpoint
 from tests.support.photos import photo_bytes
 from tests.support.processes import PLACEWISE, Process, start
 from tests.support.server import SERVICES_KEY, environment, run_command
-from tests.support.servers import PostgresServer, RedisServer, S3Server, start_redis
+from tests.support.servers import PostgresServer, RedisServer, start_redis
 
 SECONDS = 90.0
 CRASHING = Path(__file__).with_name("crashing_placewise.py")
@@ -169,58 +168,6 @@ def test_services_in_processes_of_their_own_do_what_the_embedded_one_does(
         for process in (extractors[1], stewards[1]):
             process.terminate()
         assert [p.wait(timeout=30) for p in (extractors[1], stewards[1])] == [0, 0]
-    assert "Traceback" not in deployment.logs()
-
-
-def test_an_extractor_that_has_never_seen_a_model_fetches_it(
-    deployment: Deployment, s3: S3Server, tmp_path: Path
-) -> None:
-    deployment.settings |= {**s3.variables(s3.new_bucket().name), "search_shard": "0/1"}
-    deployment.start("search")
-    deployment.settings["search_urls"] = deployment.address("search", 0)
-    deployment.start("gateway")
-    first = deployment.start("extractor", placewise_home=tmp_path / "first")
-    deployment.start("steward")
-    with deployment.client(1) as client:
-        until(lambda: client.get("/readyz").is_success)
-
-        def done(answer: httpx2.Response) -> bool:
-            assert answer.status_code == 202, answer.text
-            job = client.get(answer.json()["status_url"], params={"wait": 20}).json()
-            assert job["state"] != "failed", job
-            return bool(job["state"] == "succeeded")
-
-        def upload(number: int) -> httpx2.Response:
-            files = {"file": (f"{number}.jpg", photo_bytes(number))}
-            return client.post("/api/v1/upload", files=files)
-
-        files = {"file": ("best.ckpt", some_checkpoint())}
-        added = client.post("/api/v1/models", files=files, data={"name": "walks"})
-        photos = [upload(number) for number in range(3)]
-        until(lambda: done(added))
-        for photo in photos:
-            until(lambda photo=photo: done(photo))
-        first.terminate()
-        first.wait(timeout=30)
-
-        second = tmp_path / "second"
-        deployment.start("extractor", placewise_home=second)
-        switched = client.post("/api/v1/generations", json={"extractor": "gsv:walks"})
-        until(lambda: done(switched))
-        answer = client.post(
-            "/api/v1/similarity",
-            params={"top_k": 1},
-            files={"file": ("query.jpg", photo_bytes(1))},
-            headers={"Prefer": "wait=30"},
-        )
-        assert answer.status_code == 200, answer.text
-        assert answer.json()["similar_images"][0]["original_filename"] == "1.jpg"
-        model = client.get("/api/v1/models/walks").json()
-        assert model["maps"] == ["default"]
-        (fetched,) = (second / "model-cache").iterdir()
-        assert fetched.name == f"{model['sha256']}.safetensors"
-        assert fetched.stat().st_size == model["size_bytes"]
-    assert list((tmp_path / "first" / "model-cache").iterdir()) == [], "it only looked at a file"
     assert "Traceback" not in deployment.logs()
 
 

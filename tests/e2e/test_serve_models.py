@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +9,6 @@ import numpy as np
 import pytest
 
 from tests.support.checkpoints import own_output, untrained, write_checkpoint
-from tests.support.exported import SIDE, code_name, onnx_of, tiny_network, tiny_torchscript
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
 from tests.support.server import CommandLine, ServerProcess
@@ -88,53 +85,3 @@ def test_describe_makes_of_a_file_and_of_an_added_model_what_the_model_itself_ma
     expected = ("describe", photo, "--extractor", "gsv:nobody", "--out", out)
     assert "model_missing" in placewise.refused(*expected)
     assert not out.exists()
-
-
-def test_a_checkpoint_that_can_not_be_used_is_one_line(placewise: Commands, tmp_path: Path) -> None:
-    bad = tmp_path / "bad.ckpt"
-    bad.write_bytes(b"no checkpoint")
-    assert "checkpoint_unreadable" in placewise.refused("models", "add", bad, "--name", "bad")
-    checkpoint = write_checkpoint(tmp_path / "best.ckpt")
-    assert "invalid_field" in placewise.refused("models", "add", checkpoint, "--name", "a/b")
-
-
-def test_a_map_answers_while_it_changes_from_one_exported_network_to_another(
-    tmp_path: Path,
-) -> None:
-    script = tmp_path / "net.pt"
-    script.write_bytes(tiny_torchscript())
-    network = tmp_path / "net.onnx"
-    network.write_bytes(onnx_of(tiny_network(seed=8), tmp_path))
-    home = tmp_path / "home"
-    with ServerProcess(home, code_allowed=code_name(script.read_bytes())) as server:
-        placewise = Commands(tmp_path, server.home)
-        options = ("--options", f"input.size={SIDE}x{SIDE}")
-        names = [
-            placewise.json("models", "add", file, "--name", name, *options)["result"]["extractor"]
-            for file, name in ((script, "first"), (network, "second"))
-        ]
-        assert [name.partition(":")[0] for name in names] == ["torchscript", "onnx"]
-        table = placewise("models", "added").stdout
-        assert all(name in table for name in names)
-        placewise.json("maps", "switch", "default", "--extractor", names[0])
-        for number in range(PHOTOS):
-            server.indexed(photo_bytes(number), f"{number}.jpg")
-        found: list[str] = []
-        done = threading.Event()
-
-        def ask() -> None:
-            while not done.is_set() or len(found) < 3:
-                answer = server.ask(near_copy(2))
-                assert answer.status_code == 200, answer.text
-                found.append(answer.json()["similar_images"][0]["original_filename"])
-
-        with ThreadPoolExecutor(1) as asking:
-            asked = asking.submit(ask)
-            switched = placewise.json("maps", "switch", "default", "--extractor", names[1])
-            done.set()
-            asked.result()
-        assert switched["result"]["failed"] == 0
-        assert set(found) == {"2.jpg"}
-        answer = server.ask(near_copy(2))
-        assert answer.json()["similar_images"][0]["original_filename"] == "2.jpg"
-        assert server.client.get("/api/v1/maps/default").json()["extractor"] == names[1]

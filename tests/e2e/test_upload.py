@@ -6,7 +6,10 @@ import hashlib
 import http.client
 import json
 import socket
+import threading
 import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -22,9 +25,7 @@ from tests.support.server import ServerProcess
 
 MAX_FILE_SIZE = 100_000
 UPLOAD = "/api/v1/upload"
-SETTINGS = {
-    "max_file_size": MAX_FILE_SIZE,
-}
+SETTINGS = {"max_file_size": MAX_FILE_SIZE, "max_concurrent_uploads": 1}
 
 
 def stored(server: ServerProcess) -> set[Path]:
@@ -215,6 +216,33 @@ def answer_to_unfinished(
         answer = http.client.HTTPResponse(connection)
         answer.begin()
         return answer.status, answer.headers.get_content_type(), json.load(answer)
+
+
+def test_one_concurrent_upload_too_many_gets_retry_after(server: ServerProcess) -> None:
+    goes_on = threading.Event()
+
+    def slow_form() -> Iterator[bytes]:
+        yield BEGIN_OF_FORM + photo_bytes(80)
+        goes_on.wait(timeout=60)
+        yield b"\r\n--xx--\r\n"
+
+    def receiving() -> Any:
+        return server.client.get("/api/v1/health").json()["load"]["receiving_uploads"]
+
+    form = {"Content-Type": "multipart/form-data; boundary=xx"}
+    with ThreadPoolExecutor(1) as pool:
+        slow = pool.submit(server.client.post, UPLOAD, content=slow_form(), headers=form)
+        try:
+            while not receiving():
+                assert not slow.done()
+            refused = server.upload(photo_bytes(81))
+            problem(refused, 429, "too_many_uploads")
+            assert int(refused.headers["retry-after"]) >= 1
+            assert server.ask(photo_bytes(82)).is_success, "a query photo has room of its own"
+        finally:
+            goes_on.set()
+        assert slow.result().status_code == 202
+    assert receiving() == 0
 
 
 def chunk(data: bytes) -> bytes:

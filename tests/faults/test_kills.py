@@ -14,11 +14,8 @@ import psutil
 
 from lab.benchmarks.invariants import check_invariants, count_unfinished_jobs
 from shared.catalog.database.session import Catalog
-from shared.storage import FolderStore, ObjectInfo
-from shared.storage.keys import RECONSTRUCTIONS
-from tests.support.local_features import add_features
+from shared.storage import FolderStore
 from tests.support.photos import photo_bytes
-from tests.support.reconstructed_scene import ReconstructedScene
 from tests.support.server import ServerProcess
 from tests.support.servers.daemon import has_ended
 
@@ -93,47 +90,6 @@ def test_after_five_kills_every_acknowledged_photo_is_searchable_exactly_once(
         assert counts.none_found, counts
         catalog.close()
         assert_each_finds_itself(server, uploader.acknowledged)
-
-
-def test_a_fit_that_is_killed_starts_again_after_the_restart(tmp_path: Path) -> None:
-    with ServerProcess(tmp_path / "home", extractor="test-tiny-vlad", batch_photos=2) as server:
-        for number in range(40):
-            assert server.upload(photo_bytes(number)).status_code == 202
-        job_id = server.client.post("/api/v1/vocabularies", json={"clusters": 8}).json()["job_id"]
-        while server.client.get(f"/api/v1/jobs/{job_id}").json()["progress"]["done"] < 10:
-            time.sleep(0.002)
-        server.kill()
-        server.start()
-        job = server.finished(job_id)
-        assert job["state"] == "succeeded", job
-        assert job["result"]["photos"] == 40
-        assert server.client.get("/api/v1/database/stats").json()["vocabulary"] == "provisional"
-
-
-def test_a_reconstruction_that_is_killed_continues_after_its_last_step(tmp_path: Path) -> None:
-    scene = ReconstructedScene()
-    with ServerProcess(tmp_path / "home") as server:
-        ids = [UUID(server.indexed(photo_bytes(number))) for number in range(scene.photos)]
-        server.kill()
-        catalog = Catalog(f"sqlite:///{server.home / 'catalog.sqlite'}")
-        store = FolderStore(server.home / "objects")
-        add_features(catalog, store, dict(zip(ids, scene.features.values(), strict=True)))
-        catalog.close()
-        server.start()
-        job_id = server.client.post("/api/v1/reconstructions").json()["job_id"]
-        while not (matches := [info for info in _made(store) if info.key.endswith("matches.npz")]):
-            time.sleep(0.002)
-        server.kill()
-        server.start()
-        job = server.finished(job_id)
-        assert job["state"] == "succeeded", job
-        assert job["result"]["reconstructed"] == scene.photos
-        assert matches[0] in _made(store), "the photos were matched again"
-        assert sum(info.key.endswith(".npz") for info in _made(store)) == 2
-
-
-def _made(store: FolderStore) -> list[ObjectInfo]:
-    return list(store.list(RECONSTRUCTIONS))
 
 
 def test_decoding_children_end_with_a_killed_server(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,8 +24,8 @@ from tests.support.metrics import read
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess, environment, run_command
 from tests.support.servers import S3Server
+from tests.support.waiting import wait_until
 
-WAIT_SECONDS = 60.0
 EARLY, LATE = 2, 3  # photos before and after the catalog was copied
 SETTINGS = {"orphan_age_seconds": 0, "auto_evaluate_photos": 0}
 
@@ -106,19 +105,12 @@ def _fill(running: ServerProcess, numbers: range) -> None:
     for number in numbers:
         photo = {"file": ("photo.jpg", photo_bytes(number))}
         assert running.client.post("/api/v1/upload", files=photo).status_code == 202
-    _wait_for(lambda: _searchable(running) == numbers.stop)
+    wait_until(lambda: _searchable(running) == numbers.stop)
 
 
 def _searchable(running: ServerProcess) -> int:
     (found,) = running.client.get("/api/v1/maps").json()
     return int(found["searchable"])
-
-
-def _wait_for(condition: Any) -> None:
-    deadline = time.monotonic() + WAIT_SECONDS
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
 
 
 def _figures(running: ServerProcess) -> dict[str, dict[tuple[tuple[str, str], ...], float]]:
@@ -127,7 +119,7 @@ def _figures(running: ServerProcess) -> dict[str, dict[tuple[tuple[str, str], ..
 
 def _wait_for_collection(running: ServerProcess) -> None:
     done = (("outcome", "done"), ("task", "collect_orphans"))
-    _wait_for(lambda: _figures(running).get("placewise_steward_tasks_total", {}).get(done, 0) >= 1)
+    wait_until(lambda: _figures(running).get("placewise_steward_tasks_total", {}).get(done, 0) >= 1)
 
 
 def test_wrong_catalog_stops_every_start_and_no_object_is_touched(
@@ -155,18 +147,6 @@ def test_older_catalog_stops_every_start_and_no_object_is_touched(filled: Filled
         assert "catalog_behind" in done.stderr
         assert "placewise storage rebuild" in done.stderr
     assert {info.key for info in filled.store.list("")} == before
-
-
-def test_older_catalog_that_is_made_the_owner_deletes_no_original(filled: Filled) -> None:
-    originals = filled.originals()
-    filled.remove_catalog()
-    shutil.copy(filled.older_catalog, filled.home / "catalog.sqlite")
-    assert filled.command("storage", "adopt", "--confirm").returncode == 0
-    with filled.server(**SETTINGS) as running:
-        assert _searchable(running) == EARLY
-        _wait_for_collection(running)
-        assert _figures(running)["placewise_steward_collection_held"] == {(): 1}
-    assert filled.originals() == originals
 
 
 def test_a_removed_catalog_stops_every_start_until_the_store_is_adopted_which_deletes_nothing(

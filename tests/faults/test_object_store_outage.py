@@ -1,9 +1,8 @@
-"""The object store away, silent, or killed in the middle: an error within seconds, nothing torn."""
+"""The object store away, silent or no S3 server: an error within seconds."""
 
 from __future__ import annotations
 
 import contextlib
-import os
 import socket
 import threading
 import time
@@ -14,23 +13,11 @@ import pytest
 from shared.errors import Unavailable
 from shared.storage.s3 import S3Store
 from tests.contract.storage.test_s3_store import CALLS
-from tests.support.servers import S3Server, start_s3
+from tests.support.servers import S3Server
 
 MEGABYTE = 1_000_000
 TIMEOUT_SECONDS = 3.0  # long enough to distinguish two waits from one on a busy machine
 AT_ONCE_SECONDS = 4.0  # with one more try, on a busy machine
-
-
-@pytest.fixture(scope="module")
-def breakable() -> Iterator[S3Server]:
-    """A server of this module's own."""
-    with start_s3(own=True) as server:
-        yield server
-
-
-@pytest.fixture
-def store(breakable: S3Server) -> S3Store:
-    return S3Store(breakable.new_bucket())
 
 
 @contextlib.contextmanager
@@ -41,61 +28,6 @@ def unavailable(within_seconds: float) -> Iterator[None]:
     took = time.monotonic() - begun
     assert took < within_seconds, f"it took {took:.1f} s"
     assert caught.value.code == "object_store_unavailable"
-
-
-def test_server_killed_in_the_middle_of_a_put_leaves_no_object(
-    breakable: S3Server, store: S3Store
-) -> None:
-    assert breakable.process is not None
-    store.put("originals/before", b"acknowledged")
-    writer = store.writer("originals/a")
-    writer.write(os.urandom(12 * MEGABYTE))
-    breakable.process.kill()
-    with unavailable(AT_ONCE_SECONDS):
-        writer.write(os.urandom(12 * MEGABYTE))
-    writer.abort()
-    breakable.process.start()
-    assert store.head("originals/a") is None
-    assert [info.key for info in store.list("")] == ["originals/before"]
-    assert store.get("originals/before") == b"acknowledged"
-    store.put("originals/a", b"the same process goes on")
-
-
-def test_server_killed_in_the_middle_of_a_get_gives_no_torn_object(
-    breakable: S3Server, store: S3Store
-) -> None:
-    assert breakable.process is not None
-    data = os.urandom(40 * MEGABYTE)
-    store.put("chunks/a", data)
-    with store.open("chunks/a") as file:
-        assert file.read(1000) == data[:1000]
-        breakable.process.kill()
-        with unavailable(AT_ONCE_SECONDS):
-            file.read()
-    with unavailable(AT_ONCE_SECONDS):
-        store.get("chunks/a")
-    breakable.process.start()
-    assert store.get("chunks/a") == data, "what was acknowledged outlives the kill"
-
-
-def test_paused_server_is_given_up_after_the_configured_time(breakable: S3Server) -> None:
-    assert breakable.process is not None
-    bucket = breakable.new_bucket()
-    store = S3Store(bucket)
-    store.put("a", b"x")
-    hasty = S3Store(breakable.bucket(bucket.name, s3_timeout_seconds=TIMEOUT_SECONDS))
-    breakable.process.pause()
-    try:
-        for call in (hasty.check, lambda: hasty.get("a"), lambda: hasty.put("a", b"new")):
-            with unavailable(TIMEOUT_SECONDS + AT_ONCE_SECONDS):
-                call()
-    finally:
-        breakable.process.resume()
-    store.check()
-    assert store.get("a") in (b"x", b"new"), "a put without an answer is done or not, never torn"
-
-
-# --- without a server ------------------------------------------------------------------------
 
 
 @pytest.fixture

@@ -28,24 +28,17 @@ from shared.jobs import Job
 from shared.jobs.wakeups import WakeupQueue
 from tests.support.photos import photo_bytes
 from tests.support.server import SERVICES_KEY
+from tests.support.waiting import wait_until
 
 PHOTOS_PER_SECOND = 4.0
 BEFORE_SECONDS = 10.0
 RECOVERY_SECONDS = 15.0
-END_SECONDS = 120.0  # until a backlog of the load is described, on a busy machine
 
 pytestmark = [pytest.mark.servers, pytest.mark.timeout(900)]
 
 
 numbers = itertools.count()
 acknowledged: dict[str, UUID] = {}
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + END_SECONDS
-    while not condition():
-        assert time.monotonic() < deadline, "it did not come to that"
-        time.sleep(0.1)
 
 
 @pytest.fixture(scope="module")

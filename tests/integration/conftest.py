@@ -23,8 +23,8 @@ from shared.catalog.maps import get_or_create_default_map
 from shared.config.settings import Settings
 from shared.storage import FolderStore
 from tests.integration.api_with_keys import Door
+from tests.integration.harness import Harness
 from tests.integration.in_process_api import Service
-from tests.integration.workplace import Workplace
 from tests.support.catalog_rows import add_map
 
 BATCH_PHOTOS = 4
@@ -109,23 +109,23 @@ def door(catalog: Catalog, store: FolderStore, settings: Settings) -> Door:
 
 
 @pytest.fixture
-def workplace_of(
+def harness_of(
     catalog: Catalog,
     store: FolderStore,
     settings: Settings,
     make_worker: Callable[[], ExtractorWorker],
     monkeypatch: pytest.MonkeyPatch,
-) -> Callable[[str], Workplace]:
+) -> Callable[[str], Harness]:
     """Makes a map with the extractor of that name; each call another map."""
     # One call of `advance` queues all photos, however slow the machine is.
     monkeypatch.setattr(reindex_jobs, "SLICE_SECONDS", 60.0)
 
-    def make(extractor: str) -> Workplace:
+    def make(extractor: str) -> Harness:
         name = f"map-{UUID(int=len(made))}"
         with catalog.write() as session:
             map_id = add_map(session, name, extractor).id
         made.append(map_id)
-        return Workplace(catalog, store, settings, map_id, make_worker)
+        return Harness(catalog, store, settings, map_id, make_worker)
 
     made: list[UUID] = []
     return make
@@ -139,12 +139,12 @@ def fit_at_four_photos(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def averages(workplace_of: Callable[[str], Workplace]) -> Workplace:
+def averages(harness_of: Callable[[str], Harness]) -> Harness:
     """A map whose extractor needs no vocabulary."""
-    return workplace_of("test-tiny-avg")
+    return harness_of("test-tiny-avg")
 
 
 @pytest.fixture
-def vlads(workplace_of: Callable[[str], Workplace]) -> Workplace:
+def vlads(harness_of: Callable[[str], Harness]) -> Harness:
     """A map whose extractor needs a vocabulary, and none comes with it."""
-    return workplace_of("test-tiny-vlad")
+    return harness_of("test-tiny-vlad")

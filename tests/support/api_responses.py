@@ -10,6 +10,9 @@ GENERATION_ID = "01a1fca4-c1a2-7356-bf32-75e1cb64beb2"
 TIME = "2026-11-21T05:46:58Z"
 
 JOB: dict[str, Any] = {
+    "label": "Photo",
+    "map": "default",
+    "filename": None,
     "job_id": JOB_ID,
     "kind": "index",
     "state": "succeeded",
@@ -70,6 +73,7 @@ UPLOADED: dict[str, Any] = {
     "message": "",
 }
 SIMILAR: dict[str, Any] = {
+    "rows": "float32",
     "query_file_id": None,
     "query_filename": "where.jpg",
     "processing_time_ms": 1.0,
@@ -85,6 +89,7 @@ SIMILAR: dict[str, Any] = {
     "missing": [],
 }
 GENERATION: dict[str, Any] = {
+    "rows": "float32",
     "generation_id": GENERATION_ID,
     "state": "active",
     "extractor": "efficientnet-lite0",
@@ -98,6 +103,8 @@ GENERATION: dict[str, Any] = {
     "ended_at": None,
 }
 STATS: dict[str, Any] = {
+    "failed_images": 0,
+    "next_fit_photos": None,
     "device": None,
     "map": "default",
     "map_version": 1,
@@ -119,6 +126,15 @@ STATS: dict[str, Any] = {
     "counted_at": TIME,
 }
 MAP: dict[str, Any] = {
+    "failed_photos": 0,
+    "located": 0,
+    "measurement": "not_measured",
+    "place_labels_are_automatic": False,
+    "auto_fit": True,
+    "matching": "auto",
+    "local_features": None,
+    "model_change_id": None,
+    "next_fit_photos": None,
     "name": "tower",
     "extractor": "efficientnet-lite0-vlad128",
     "version": 0,

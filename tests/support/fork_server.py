@@ -39,7 +39,7 @@ MODULES = (
     "services.steward.evaluation_worker",
     "services.steward.scheduler",
     "lab.training.run",
-    "shared.jobs.celery_wakeups",
+    "shared.jobs.celery_messages",
     "shared.storage.open_store",
     "shared.descriptors.extractor",
     "shared.descriptors.vocabulary_file",

@@ -229,12 +229,12 @@ class ServerProcess:
         file_id: str = answer.json()["file_id"]
         return file_id
 
-    def finished(self, job_id: str, seconds: float = 60) -> dict[str, Any]:
-        """The job once it has ended."""
+    def finished(self, job_id: str, seconds: float = 60, **params: Any) -> dict[str, Any]:
+        """The job once it has ended; `params` may name its map."""
         deadline = time.monotonic() + seconds
         while True:
             job: dict[str, Any] = self.client.get(
-                f"/api/v1/jobs/{job_id}", params={"wait": 5}
+                f"/api/v1/jobs/{job_id}", params={"wait": 5, **params}
             ).json()
             if job["state"] in ("succeeded", "failed", "cancelled"):
                 return job

@@ -131,7 +131,6 @@ class SmallMap:
         reference: Reference,
         k: int = 10,
         min_version: int | None = None,
-        min_score: float | None = None,
         exclude: tuple[UUID, ...] = (),
         **photos: Any,
     ) -> SearchRequest:
@@ -143,7 +142,6 @@ class SmallMap:
             min_version=self.version if min_version is None else min_version,
             k=k,
             photos=PhotoFilter(**photos),
-            min_score=min_score,
             exclude=exclude,
         )
 

@@ -174,7 +174,7 @@ def evaluate(
             min=2,
             metavar="FRAMES",
             help="With --sequences: also carry the camera to another place after every so many "
-            "frames, and count the frames until it is found again.",
+            "frames, and count the frames until it is relocalised.",
         ),
     ] = None,
     place_labels_are_paths: Annotated[

@@ -35,7 +35,12 @@ from lab.evaluation.ranking import (
     describe_to_matrix,
     refused_photos_error,
 )
-from lab.evaluation.results import EvaluationResult, EvaluationRun, load_matrix
+from lab.evaluation.results import (
+    EvaluationResult,
+    EvaluationRun,
+    load_matrix,
+    read_comparable_run,
+)
 from placewise.answers import Similar, Uploaded
 from placewise.client import Client
 from services.cli.client import active_generation, connect
@@ -255,6 +260,9 @@ def evaluate_sets(
         )
     if ground_truth is not None:
         evaluation_sets = [_replace_ground_truth(evaluation_sets[0], ground_truth)]
+    if options.against is not None:  # refused before minutes of work
+        for each in evaluation_sets:
+            read_comparable_run(options.against, each)
     results: list[EvaluationResult] = []
     run: EvaluationRun | None = None
     with progress_bar() as progress:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
 from rich.progress import Progress
 
 from lab.cli.descriptors.extractors import (
@@ -27,6 +29,7 @@ from shared.descriptors.vocabulary import ClusterCentres
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
 from shared.extractor_config.configs import get_extractor_config
 from shared.imaging.decode import DECODER
+from shared.imaging.preprocessing import Pixels
 
 CACHE_FOLDER = "descriptors"
 CACHE_BYTES = 20_000_000_000
@@ -92,6 +95,7 @@ def extractor_describer(
     progress: Progress,
     *,
     fit: bool = False,
+    extractor: Extractor | None = None,
 ) -> Describer:
     """Create a describer from an extractor.
 
@@ -100,7 +104,7 @@ def extractor_describer(
     """
     about: dict[str, Any] = {}
     config = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
-    extractor = load_extractor(config, settings)
+    extractor = extractor or load_extractor(config, settings)
     if config.needs_vocabulary and vocabulary is None and (fit or not config.shipped_vocabulary):
         database = [photo.path for photo in evaluation_set.database]
         centres: ClusterCentres | None = _fit_vocabulary(extractor, database, settings, progress)
@@ -113,6 +117,24 @@ def extractor_describer(
     describe = photo_describer(extractor, centres, settings)
     about |= {"precision": extractor.precision, "device": extractor.backbone.device.type}
     return Describer(config.name, _with_cache(describe, spec, settings), spec, about)
+
+
+class FeatureCache(Extractor):
+    """Extractor that computes the features of each photo once, for several vocabularies."""
+
+    def __init__(self, name: str, settings: Settings) -> None:
+        config = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
+        loaded = load_extractor(config, settings)
+        super().__init__(config, loaded.backbone.device, backbone=loaded.backbone)
+        self._features: dict[bytes, torch.Tensor] = {}
+
+    def features(self, pixels: Pixels) -> torch.Tensor:
+        keys = [hashlib.sha256(photo).digest() for photo in pixels]
+        new = [index for index, key in enumerate(keys) if key not in self._features]
+        if new:
+            found = super().features(pixels[new])
+            self._features |= {keys[i]: each for i, each in zip(new, found, strict=True)}
+        return torch.stack([self._features[key] for key in keys])
 
 
 def _fit_vocabulary(

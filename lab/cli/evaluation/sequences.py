@@ -181,8 +181,8 @@ def _print_figures(name: str, figures: Json) -> None:
     if "kidnapped" in figures:
         rows |= {
             "carried to another place": f"{figures['kidnapped']} times",
-            "found again within 40 frames": format_percent(figures["found_within_40_frames"]),
-            "frames until found again": _frame_counts(figures["frames_until_found"]),
+            "relocalised within 40 frames": format_percent(figures["found_within_40_frames"]),
+            "frames until relocalised": _frame_counts(figures["frames_until_found"]),
         }
     table = Table("tracking", Column("value", justify="right"))
     for title, value in rows.items():

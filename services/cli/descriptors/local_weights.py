@@ -130,31 +130,3 @@ def has_local_weights(config: ExtractorConfig, settings: Settings) -> bool:
     except Misconfigured:
         return False
     return found.fingerprint is not None or _load_record(found.key) is not None
-
-
-def suggest_extractor(settings: Settings) -> str | None:
-    """Suggest an extractor for new maps that finds more than the default one, in one line.
-
-    Returns:
-        A line, if EXTRACTOR and DINO_MODEL are unset, a GPU is available, and the weights of an
-        allowed torch.hub extractor or of DINOv2 (the largest first) are here; otherwise None.
-    """
-    if {"extractor", "dino_model"} & settings.model_fields_set or settings.device == "cpu":
-        return None
-    configs = list(list_extractor_configs(settings))
-    hub = [config for config in configs if config.hub is not None]
-    dinov2 = [config for config in configs if config.depth is not None]
-    dinov2.sort(key=lambda config: config.parameters or 0, reverse=True)
-    for config in (*hub, *dinov2):
-        if has_local_weights(config, settings):
-            break
-    else:
-        return None
-    import torch  # seconds, so only where there are weights
-
-    if not torch.cuda.is_available():
-        return None
-    return (
-        f"a GPU and the weights of {config.name} are here; it finds more than the default "
-        f"extractor: EXTRACTOR={config.name} uses it for new maps"
-    )

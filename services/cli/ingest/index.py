@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
@@ -45,15 +44,13 @@ from services.cli.output import (
     MapOption,
     ServerOption,
     TimeZoneOption,
-    atomic_write,
-    check_output_path,
     print_failures,
     print_json,
     print_note,
     printable_text,
     progress_bar,
 )
-from shared.catalog.photo_role import PhotoRole
+from shared.enums import PhotoRole
 from shared.errors import InvalidRequest
 from shared.imaging.file_formats import PHOTO_SUFFIXES
 
@@ -114,12 +111,6 @@ def index(
             "for photos of this machine.",
         ),
     ] = None,
-    failures: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.jsonl", help="Write refused and failed photos with their reasons."
-        ),
-    ] = None,
     no_fit: NoFitOption = False,
     map_name: MapOption = None,
     server: ServerOption = None,
@@ -146,8 +137,6 @@ def index(
         "--update": update,
         "--journal": journal,
     }
-    if failures is not None:
-        check_output_path(failures, ".jsonl", "a list of failures")
     source, path = sources[0], Path(sources[0])
     photos: list[LocalPhoto] = []
     batch: Callable[[Client], BatchStarted] | None = None  # of objects that the server has
@@ -221,8 +210,6 @@ def index(
             used = stack.enter_context(UploadJournal(journal, url, map_name)) if journal else None
             report = upload_photos(client, photos, progress, update=update, journal=used)
     report |= about_sources
-    if failures is not None:
-        _write_failures(failures, report)
     if as_json:
         print_json(report)
     else:
@@ -239,14 +226,6 @@ def _reject_options(source: str, options: Mapping[str, object]) -> None:
             f"{', '.join(invalid)}: not supported for {source}. Put the metadata into its table or "
             "manifest, or index a folder.",
         )
-
-
-def _write_failures(out: Path, report: Json) -> None:
-    """Write a JSON object per photo: `outcome`, `path`, `reason`; an empty file if none failed."""
-    with atomic_write(out) as file:
-        for outcome in ("refused", "failed"):
-            for item in report[outcome]:
-                file.write(json.dumps({"outcome": outcome, **item}).encode() + b"\n")
 
 
 def _list_suffixes(report: Json) -> str:

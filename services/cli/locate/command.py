@@ -48,7 +48,6 @@ from services.cli.output import (
 )
 from shared.config.command_line import command_line
 from shared.errors import PlacewiseError
-from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
 from shared.geotagging.evidence import (
     KnownPosition,
     PictureEvidence,
@@ -215,7 +214,8 @@ def _search_photo(client: Client, photo_count: int, photo: FolderPhoto) -> Searc
         if error.status not in (400, 413, 415, 422):  # 400: an empty file
             raise
         return SearchedPhoto(error=error.detail)
-    label = next((each for each in answer.estimate.levels if each.place), None)
+    estimate = answer.estimate
+    label = next((each for each in estimate.levels if each.place and estimate.has_place), None)
     return SearchedPhoto(
         picture_evidence(answer, photo_count),
         label.place if label else None,
@@ -241,7 +241,7 @@ def _locate_photo(
         searched.place,
         searched.place_probability,
         searched.error,
-        neighbours.why_unknown(photo),
+        neighbours.why_unknown(photo, searched.evidence),
     )
 
 
@@ -252,7 +252,8 @@ def picture_evidence(answer: Similar, photo_count: int) -> PictureEvidence:
         photo_count: Number of photos of the map.
     """
     estimate = answer.estimate
-    missing = estimate.not_in_map_probability
+    is_unlocated = not (estimate.has_place or estimate.levels)
+    stated = (estimate.not_in_map_probability, estimate.elsewhere)
     return PictureEvidence(
         [
             SimilarPosition(
@@ -262,7 +263,7 @@ def picture_evidence(answer: Similar, photo_count: int) -> PictureEvidence:
                 photo.relative_path or photo.original_filename,
             )
             for photo in answer.similar_images
-            if photo.latitude is not None and photo.longitude is not None
+            if photo.latitude is not None and photo.longitude is not None and not is_unlocated
         ],
         [
             ProbableCircle(level.latitude, level.longitude, level.radius_m, level.probability)
@@ -271,9 +272,10 @@ def picture_evidence(answer: Similar, photo_count: int) -> PictureEvidence:
             and level.longitude is not None
             and level.radius_m is not None
         ],
-        OUT_OF_MAP_SHARE if missing is None else missing,
+        next((share for share in stated if share is not None), 1.0),
         photo_count,
         _pose_position(answer.pose),
+        estimate.headline,
     )
 
 
@@ -328,6 +330,7 @@ def _to_json(
                 "position": asdict(each.proposal) if each.proposal else None,
                 "place": each.place,
                 "place_probability": each.place_probability,
+                "why_unknown": None if each.proposal else each.why_unknown,
                 "error": each.error,
             }
             for each in located

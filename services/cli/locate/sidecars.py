@@ -62,12 +62,12 @@ def add_position(
         "GPSLatitude": _format_degrees(latitude, "NS"),
         "GPSLongitude": _format_degrees(longitude, "EW"),
         "GPSMapDatum": "WGS-84",
-        "GPSHPositioningError": hundredths(radius_68_m),
+        "GPSHPositioningError": _hundredths(radius_68_m),
         "GPSProcessingMethod": METHOD,
     }
     if heading is not None and "GPSImgDirection" not in there:
         properties |= {
-            "GPSImgDirection": hundredths(heading),
+            "GPSImgDirection": _hundredths(heading),
             "GPSImgDirectionRef": TRUE_NORTH,
         }
     added = "".join(
@@ -80,7 +80,7 @@ def add_position(
     return data[:offset] + element.encode() + data[offset:]
 
 
-def hundredths(value: float) -> str:
+def _hundredths(value: float) -> str:
     """Return a length or an angle as a rational of EXIF."""
     return f"{round(100 * value)}/100"
 

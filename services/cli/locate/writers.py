@@ -1,6 +1,6 @@
 """Writes accepted proposals: XMP sidecars, EXIF, a CSV table or GPX waypoints.
 
-EXIF is written by the program exiftool or the library pyexiv2.
+EXIF is written by the program exiftool.
 """
 
 from __future__ import annotations
@@ -14,19 +14,13 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from importlib.util import find_spec
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
 from services.cli.ingest.local_headers import find_sidecars
 from services.cli.locate.folder import FolderPhoto, read_photo
-from services.cli.locate.sidecars import (
-    METHOD,
-    TRUE_NORTH,
-    add_position,
-    hundredths,
-    sidecar_path,
-)
+from services.cli.locate.sidecars import METHOD, TRUE_NORTH, add_position, sidecar_path
 from services.cli.locate.undo_journal import UndoJournal, open_journal
 from services.cli.output import utf8_path
 from shared.errors import Misconfigured, PlacewiseError, Unprocessable
@@ -204,22 +198,19 @@ ExifWriter = Callable[[Path, Proposal], None]
 
 
 def find_exif_writer() -> ExifWriter:
-    """Return the writer that is installed.
+    """Return the writer of EXIF, which is the program exiftool.
 
     Raises:
         Misconfigured: `no_exif_writer`.
     """
     program = shutil.which("exiftool")
-    if program:
-        return lambda photo, proposal: _write_with_exiftool(program, photo, proposal)
-    if find_spec("pyexiv2"):
-        return _write_with_pyexiv2
-    raise Misconfigured(
-        "no_exif_writer",
-        "Writing EXIF needs exiftool (Debian, Ubuntu: apt install libimage-exiftool-perl; macOS: "
-        "brew install exiftool), or pyexiv2: uv pip install '.[exif]' in the repository. "
-        "--write sidecar needs neither.",
-    )
+    if program is None:
+        raise Misconfigured(
+            "no_exif_writer",
+            "Writing EXIF needs exiftool (Debian, Ubuntu: apt install libimage-exiftool-perl; "
+            "macOS: brew install exiftool). --write sidecar does not.",
+        )
+    return partial(_write_with_exiftool, program)
 
 
 def write_exif(writer: ExifWriter, photo: Path, proposal: Proposal) -> None:
@@ -261,7 +252,10 @@ def _write_with_exiftool(program: str, photo: Path, proposal: Proposal) -> None:
         f"-GPSProcessingMethod={METHOD}",
     ]
     if proposal.heading is not None:
-        arguments += [f"-GPSImgDirection={proposal.heading:.2f}", "-GPSImgDirectionRef=T"]
+        arguments += [
+            f"-GPSImgDirection={proposal.heading:.2f}",
+            f"-GPSImgDirectionRef={TRUE_NORTH}",
+        ]
     run = subprocess.run(  # noqa: S603 the program is exiftool
         [program, "-q", "-overwrite_original", *arguments, str(photo.absolute())],
         capture_output=True,
@@ -270,35 +264,3 @@ def _write_with_exiftool(program: str, photo: Path, proposal: Proposal) -> None:
     if run.returncode:
         reason = " ".join(run.stderr.split())
         raise Unprocessable("exif_not_written", f"exiftool can't write the EXIF: {reason}")
-
-
-def _write_with_pyexiv2(photo: Path, proposal: Proposal) -> None:
-    import pyexiv2  # optional
-
-    values = {
-        "GPSVersionID": "2 3 0 0",
-        "GPSLatitude": _rationals(proposal.latitude),
-        "GPSLatitudeRef": "NS"[proposal.latitude < 0],
-        "GPSLongitude": _rationals(proposal.longitude),
-        "GPSLongitudeRef": "EW"[proposal.longitude < 0],
-        "GPSMapDatum": "WGS-84",
-        "GPSHPositioningError": hundredths(proposal.radius_68_m),
-        "GPSProcessingMethod": f'charset="Ascii" {METHOD}',
-    }
-    if proposal.heading is not None:
-        values |= {
-            "GPSImgDirection": hundredths(proposal.heading),
-            "GPSImgDirectionRef": TRUE_NORTH,
-        }
-    try:
-        with pyexiv2.Image(str(photo)) as image:
-            image.modify_exif({f"Exif.GPSInfo.{name}": text for name, text in values.items()})
-    except RuntimeError as error:
-        raise Unprocessable("exif_not_written", f"pyexiv2 can't write the EXIF: {error}") from error
-
-
-def _rationals(degrees: float) -> str:
-    """Format degrees as EXIF's degrees, minutes and seconds."""
-    minutes, seconds = divmod(round(abs(degrees) * 3600, 5), 60)
-    whole, minutes = divmod(minutes, 60)
-    return f"{whole:.0f}/1 {minutes:.0f}/1 {round(seconds * 100_000)}/100000"

@@ -17,13 +17,11 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
-from services.cli.descriptors.local_weights import suggest_extractor
 from shared.catalog.database.schema import check_pages
 from shared.catalog.tables import open_catalog
 from shared.config.private_files import is_open_to_others
 from shared.config.settings import Settings, memory_limit_bytes
 from shared.errors import Misconfigured
-from shared.extractor_config.configs import ExtractorConfig
 
 BYTES_PER_PARAMETER = 4  # float32
 # Twice the memory measured in the forward pass of ViT-g, the widest backbone, at 224 x 224 pixels:
@@ -85,6 +83,7 @@ def check_memory(settings: Settings) -> str:
     if config.parameters is None or config.preprocessing is None:
         return f"the size of {config.name} is unknown until it is loaded"
     device = choose_device(settings.device)
+    settings = settings.for_device(device.type)
     if device.type == "cuda":
         available, owner = torch.cuda.get_device_properties(device).total_memory, "the GPU"
     else:
@@ -126,14 +125,9 @@ def check_extractor(settings: Settings) -> str:
     Raises:
         Misconfigured: The weights are missing or don't fit the extractor.
     """
-    summary = _check_weights(settings.extractor_config(settings.new_map_extractor), settings)
-    suggestion = suggest_extractor(settings)
-    return f"{summary}; {suggestion}" if suggestion else summary
-
-
-def _check_weights(config: ExtractorConfig, settings: Settings) -> str:
     from shared.descriptors.backbones import backbone_class
 
+    config = settings.extractor_config(settings.new_map_extractor)
     if not config.for_tests and config.model is None:
         path = backbone_class(config).find_weights(config, settings.dino_weights).path
         if config.depth is not None:

@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from uuid import UUID
 
-from sqlalchemy.exc import SQLAlchemyError
-
 from services.cli.recovery.backup import (
     BackupFolder,
     BackupManifest,
@@ -23,7 +21,6 @@ from services.cli.recovery.backup import (
     create_backup,
 )
 from services.steward.tasks.orphans import StoreCount, collect_orphans, count_store, find_orphans
-from shared.catalog.database.errors import explain_outage
 from shared.catalog.database.schema import check_schema, migrate, opening
 from shared.catalog.database.session import NO_TIMEOUTS, Catalog
 from shared.catalog.installation import (
@@ -68,18 +65,10 @@ def _open_storage(settings: Settings, command: str) -> Iterator[tuple[Catalog, O
             f"No catalog found in {settings.placewise_home}. Set PLACEWISE_HOME to the folder of "
             "the installation, or set DATABASE_URL.",
         )
-    catalog = open_catalog(settings, command, NO_TIMEOUTS)
-    try:
+    with contextlib.closing(open_catalog(settings, command, NO_TIMEOUTS)) as catalog:
         with opening(catalog):
             check_schema(catalog)
         yield catalog, open_installation_store(catalog, settings, exclusive=False)
-    except SQLAlchemyError as error:
-        unavailable = explain_outage(error)
-        if unavailable is None:
-            raise
-        raise unavailable from error
-    finally:
-        catalog.close()
 
 
 def back_up(settings: Settings, out: Path, progress: BackupProgress) -> BackupManifest:

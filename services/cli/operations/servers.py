@@ -54,15 +54,9 @@ def serve() -> None:
 
     changed = threading.Event()
     settings = read_settings()
-    is_first_start = not (settings.placewise_home / "catalog.sqlite").exists()
 
     def announce(running: Standalone) -> None:
-        suggestion = None
-        if is_first_start and settings.database_url is None:
-            from services.cli.descriptors.local_weights import suggest_extractor
-
-            suggestion = suggest_extractor(settings)
-        print_note(_startup_message(running, settings, suggestion))
+        print_note(_startup_message(running, settings))
 
         def stop() -> None:
             running.server.should_exit = True
@@ -82,7 +76,7 @@ def serve() -> None:
         restart_process()
 
 
-def _startup_message(running: Standalone, settings: Settings, suggestion: str | None) -> str:
+def _startup_message(running: Standalone, settings: Settings) -> str:
     """Return what `serve` prints; the address is at the end, where it stays visible."""
     # Complete: without its folder, a command of another shell would start a second Placewise.
     command = partial(command_line, home=settings.placewise_home)
@@ -106,8 +100,6 @@ def _startup_message(running: Standalone, settings: Settings, suggestion: str | 
         lines.append(f"  phone:    {running.lan_url}   (in the same network)")
         if err_console.is_terminal:
             lines.append(_qr_code(running.lan_url))
-    if suggestion:
-        lines.append(f"  note:     {suggestion}")
     lines.append(f"  API:      {url}/docs")
     lines.append(f"  open:     {url}")
     return "\n".join(lines)

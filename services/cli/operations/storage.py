@@ -42,7 +42,14 @@ REMEDIES = {
     "file": "its batch fails: upload it again",
 }
 
+app = typer.Typer(
+    help="Verify, back up, restore and rebuild what is stored; manage the bucket, its owner, "
+    "orphans and trash.",
+    no_args_is_help=True,
+)
 
+
+@app.command("verify")
 def verify(
     originals: Annotated[
         bool, typer.Option("--originals", help="Also check every original photo against its hash.")
@@ -130,13 +137,12 @@ def _print_report(report: IntegrityReport, queued: int | None) -> None:
         print_note("Photos without their originals can't be described again.")
 
 
-app = typer.Typer(
-    help="Verify, back up, restore and rebuild what is stored; manage the bucket, its owner, "
-    "orphans and trash.",
-    no_args_is_help=True,
-)
+app.command("backup")(backup)
+app.command("restore")(restore)
+app.command("rebuild")(rebuild_catalog)
 
 
+@app.command("migrate")
 def migrate() -> None:
     """Create the catalog's tables in an empty database (DATABASE_URL).
 
@@ -148,12 +154,6 @@ def migrate() -> None:
     installation_id = migrate_catalog(read_settings())
     print_note(f"The catalog has its tables (installation {installation_id})")
 
-
-app.command("verify")(verify)
-app.command("backup")(backup)
-app.command("restore")(restore)
-app.command("rebuild")(rebuild_catalog)
-app.command("migrate")(migrate)
 
 ConfirmOption = Annotated[
     bool, typer.Option("--confirm", help="Apply the change. Without it, the command only reports.")

@@ -6,7 +6,6 @@ import tempfile
 from collections import deque
 from collections.abc import Iterable, Sequence, Sized
 from datetime import UTC, datetime
-from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
 from uuid import UUID
@@ -40,7 +39,6 @@ from services.cli.track.frame_sources import (
     read_video_frames,
 )
 from services.cli.track.track_files import (
-    PICTURE_SUFFIXES,
     WRITERS,
     check_track_files,
     track_row,
@@ -51,7 +49,6 @@ from shared.tracks.motion import MOTION_MODELS
 
 FRAMES_AHEAD = 8  # stored before the first of them must be applied: they are described as a batch
 WAIT_SECONDS = 20.0
-MAX_PHOTOS_DRAWN = 20_000
 
 
 def track(
@@ -143,10 +140,8 @@ def track(
                 raise
             print_note(error.detail)
             result = client.track(begun.track_id)
-        draws = any(file.suffix.lower() in PICTURE_SUFFIXES for file in files)
-        photos = list(islice(client.photos(role="database"), MAX_PHOTOS_DRAWN)) if draws else []
     for file in files:
-        write_track_file(file, result, photos)
+        write_track_file(file, result)
     if as_json:
         print_json(result)
     else:

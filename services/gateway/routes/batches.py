@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from typing import Annotated, Any
-from uuid import UUID
 
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
@@ -28,11 +27,7 @@ from services.gateway.dependencies import (
     invalid_cursor_error,
 )
 from services.gateway.idempotency import IdempotentFormDep, IdempotentReplay, IdempotentRequest
-from services.gateway.schemas import (
-    JobAcceptedResponse,
-    ResponseModel,
-    job_url,
-)
+from services.gateway.responses import JobAcceptedResponse, job_url
 from services.gateway.uploads.batch import (
     FILES_FIELD,
     MANIFEST_FIELD,
@@ -60,6 +55,8 @@ from shared.ingest.photo_metadata import (
     read_jsonl_manifest,
 )
 from shared.jobs import JobKind, JobState
+from shared.responses import ResponseModel
+from shared.responses.jobs import BatchItemResponse
 from shared.storage.keys import IMPORTS, is_valid_key
 
 router = APIRouter(tags=["batches"])
@@ -107,19 +104,6 @@ class BatchAcceptedResponse(JobAcceptedResponse):
     """202: poll `status_url`; `items_url` lists the photos."""
 
     items_url: str
-
-
-class BatchItemResponse(ResponseModel):
-    number: int = Field(description="from 1, in upload order")
-    name: str
-    state: JobState = Field(description="`succeeded`: searchable")
-    file_id: UUID | None = Field(validation_alias="photo_id")
-    job_id: UUID | None = Field(
-        validation_alias="photo_job_id", description="the job that describes the photo"
-    )
-    already_there: bool = Field(description="the map already had these bytes; nothing was stored")
-    line: int | None = Field(description="line of the photo in the manifest, if any")
-    error: dict[str, Any] | None = Field(description="an RFC 9457 problem")
 
 
 class BatchItemsResponse(ResponseModel):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import datetime
 from typing import Any
 from uuid import UUID
 
@@ -15,7 +14,7 @@ from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import GatewayDep, MapQuery, PageQuery
 from services.gateway.idempotency import IdempotentDep
 from services.gateway.json_bodies import JsonRoute
-from services.gateway.schemas import JobAcceptedResponse, ResponseModel
+from services.gateway.responses import JobAcceptedResponse
 from shared.catalog.chunks import has_geotagged
 from shared.catalog.generations import (
     Generation,
@@ -28,6 +27,8 @@ from shared.errors import Conflict
 from shared.http.request_model import RequestModel
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
+from shared.responses import ResponseModel
+from shared.responses.maps import EvaluationResponse
 
 router = APIRouter(tags=["evaluations"], route_class=JsonRoute)
 
@@ -39,21 +40,6 @@ class EvaluationRequest(RequestModel):
         1000, ge=1, le=1_000_000, description="maximum number of photos of the map to query with"
     )
     seed: int = Field(0, ge=0, le=2**31 - 1)
-
-
-class EvaluationResponse(ResponseModel):
-    evaluation_id: UUID = Field(validation_alias="id")
-    generation_id: UUID
-    automatic: bool = Field(description="started automatically after a change of the map")
-    searchable: int = Field(description="number of searchable photos at that time")
-    figures: dict[str, Any] = Field(
-        description="`leave_one_out`: queries with the map's own photos, each without itself, "
-        "which flatters; `leave_one_out_without_sequence`: each without the photos that were taken "
-        "within 60 s of it, or whose names differ by one number only, at most 60 apart; "
-        "`labelled_queries`: queries with the photos of role `query`; R@k is the share of queries "
-        "with a right photo among the first k, of those that have a right photo in the map"
-    )
-    evaluated_at: datetime
 
 
 class EvaluationsResponse(ResponseModel):

@@ -14,7 +14,6 @@ from sqlalchemy.exc import SQLAlchemyError
 from services.gateway.admission import AdmissionControl, AdmissionDep, UploadKind
 from services.gateway.authentication import READ
 from services.gateway.dependencies import ALL_MAPS, NO_PARAMETERS, GatewayContext, GatewayDep
-from services.gateway.schemas import ResponseModel
 from shared.catalog.database.errors import to_unavailable
 from shared.catalog.jobs import is_job_overdue
 from shared.catalog.maps import (
@@ -27,6 +26,7 @@ from shared.catalog.processes import PROCESS_TIMEOUT_SECONDS, list_processes
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, StorageFull, TooManyRequests
 from shared.jobs.queue_depth import QueueDepth
+from shared.responses import ResponseModel
 from shared.storage.trash import read_hold
 
 probe_router = APIRouter(tags=["operations"])

@@ -28,7 +28,7 @@ from services.gateway.dependencies import (
     wait_for_job,
 )
 from services.gateway.idempotency import IdempotentDep
-from services.gateway.schemas import JobResponse, JobsResponse
+from services.gateway.responses import JobResponse, JobsResponse
 from shared.catalog.database.errors import to_unavailable
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, UNFINISHED_STATES, get_job, list_jobs
 from shared.catalog.maps import get_map

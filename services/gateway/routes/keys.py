@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import datetime
 from typing import Annotated
-from uuid import UUID
 
 from fastapi import APIRouter
 from pydantic import Field
@@ -12,10 +10,10 @@ from pydantic import Field
 from services.gateway.authentication import ADMIN
 from services.gateway.dependencies import NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep, KeyId
 from services.gateway.json_bodies import JsonRoute
-from services.gateway.schemas import ResponseModel
 from shared.catalog.api_keys import KeyLimits, create_api_key, list_api_keys, revoke_api_key
 from shared.catalog.maps import MAP_NAME_PATTERN
 from shared.http.request_model import RequestModel
+from shared.responses.maps import CreatedKeyResponse, KeyResponse
 from shared.security.api_keys import Scope
 
 router = APIRouter(tags=["administration"], dependencies=[NO_PARAMETERS], route_class=JsonRoute)
@@ -49,25 +47,6 @@ class CreateKeyRequest(RequestModel):
     requests_per_minute: Annotated[int | None, Field(ge=1, le=10**9)] = None
     upload_bytes_per_day: KeyLimit = None
     max_photos: KeyLimit = None
-
-
-class KeyResponse(ResponseModel):
-    id: UUID
-    name: str
-    prefix: str = Field(description="first characters of the key")
-    scopes: list[Scope]
-    maps: list[str] | None = Field(description="the only maps that it may use; null: all maps")
-    requests_per_minute: int | None
-    upload_bytes_per_day: int | None
-    max_photos: int | None
-    created_at: datetime
-    expires_at: datetime | None
-    last_used_at: datetime | None = Field(description="accurate to a minute")
-    revoked_at: datetime | None
-
-
-class CreatedKeyResponse(KeyResponse):
-    key: str = Field(description="the secret key; it is shown only once")
 
 
 @router.get("/keys", operation_id="list_keys", dependencies=[ADMIN])

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import re
-from datetime import datetime
 from typing import Annotated, Literal
-from uuid import UUID
 
 from fastapi import APIRouter, Depends, Path, Request
 from pydantic import Field, field_validator
@@ -15,7 +13,6 @@ from services.gateway.authentication import READ, WRITE, get_caller
 from services.gateway.dependencies import ALL_MAPS, NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep
 from services.gateway.idempotency import IdempotentDep
 from services.gateway.json_bodies import JsonRoute
-from services.gateway.schemas import ResponseModel
 from shared.catalog.chunks import count_features, find_features_model
 from shared.catalog.generations import Generation, RowType, active_generation
 from shared.catalog.jobs import UNFINISHED_STATES, list_jobs
@@ -39,16 +36,23 @@ from shared.config.settings import Settings
 from shared.errors import Misconfigured, invalid_field_error
 from shared.evaluation.places.fit import MIN_OWN_PHOTOS
 from shared.evaluation.places.levels import LevelScheme
-from shared.evaluation.places.probability import PlaceModel
-from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
+from shared.evaluation.places.probability import ELSEWHERE_SHARE, PlaceModel
 from shared.http.request_model import RequestModel
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.model_changes import get_unfinished_model_change, start_reindex
 from shared.jobs.transitions import cancel_jobs
+from shared.responses.maps import (
+    AUTO_FIT,
+    ELSEWHERE,
+    MATCHING,
+    DeletedMapResponse,
+    LocalFeaturesResponse,
+    MapResponse,
+    Measurement,
+)
 
 router = APIRouter(tags=["maps"], dependencies=[NO_PARAMETERS], route_class=JsonRoute)
 
-Measurement = Literal["measured", "running", "due", "not_measured", "too_few_photos"]
 MapNamePath = Annotated[
     str, Path(description="the map's name", min_length=1, max_length=100, pattern=NO_NUL_PATTERN)
 ]
@@ -59,16 +63,6 @@ async def _check_map(request: Request, name: MapNamePath) -> None:
 
 
 CHECK_MAP = Depends(_check_map)
-
-
-AUTO_FIT = (
-    f"whether a vocabulary is fitted automatically: at {MIN_PHOTOS_TO_FIT} photos, and whenever "
-    "the map has doubled since the last fit. Importing or choosing a vocabulary sets it to false"
-)
-MATCHING = (
-    "whether local features of its photos are computed and matched: `on`, `off`, or `auto`: until "
-    "an evaluation finds that matches do not improve the answers"
-)
 
 
 class CreateMapRequest(RequestModel):
@@ -91,6 +85,9 @@ class CreateMapRequest(RequestModel):
     )
     auto_fit: bool = Field(True, description=AUTO_FIT)
     matching: Matching = Field(Matching.AUTO, description=MATCHING)
+    elsewhere: float | None = Field(
+        None, gt=0, lt=1, description=f"{ELSEWHERE}; omitted: {ELSEWHERE_SHARE}"
+    )
 
     @field_validator("name")
     @classmethod
@@ -119,74 +116,9 @@ class UpdateMapRequest(RequestModel):
         description=f"{MATCHING}. `on` starts a model change if photos have no local features yet; "
         "omitted: unchanged",
     )
-
-
-class LocalFeaturesResponse(ResponseModel):
-    model: str | None = Field(description="detector and its version, `xfeat@0f5187fd7bed`")
-    photos: int = Field(description="photos with local features; deleted ones may be among them")
-    missing: int = Field(description="searchable photos without")
-    bytes: int
-    used: bool | None = Field(
-        description="whether searches use matches as evidence; null until an evaluation decides it"
+    elsewhere: float | None = Field(
+        None, gt=0, lt=1, description=f"{ELSEWHERE}; omitted: unchanged"
     )
-
-
-class MapResponse(ResponseModel):
-    name: str
-    extractor: str
-    version: int = Field(description="incremented by every change of the searchable photos")
-    photos: int
-    searchable: int
-    failed_photos: int = Field(
-        description="stored photos that can't be searched for, because their description failed: "
-        "GET /search?failed=true lists them, and the next model change describes them again"
-    )
-    labelled_queries: int
-    located: int = Field(description="searchable photos with coordinates or a label")
-    measurement: Measurement = Field(
-        description="whether it is known how certain the map's estimates are: `measured` by an "
-        "evaluation; `running`: it is being evaluated; `due`: an evaluation will start by itself; "
-        "`not_measured`: start one (POST /evaluations); `too_few_photos`: it takes 20 with "
-        "coordinates or a label"
-    )
-    counted_at: datetime = Field(description="when the four counts above were computed")
-    generation_id: UUID | None
-    vocabulary: str | None = Field(
-        description="`own`, `provisional`, `foreign`, `pending` or `none`; null before the first "
-        "photo"
-    )
-    dimension: int | None = Field(
-        description="dimension of its descriptors; null before the first photo"
-    )
-    pca_from: int | None = Field(description="dimension before PCA; null without PCA")
-    place_labels_are_paths: bool = Field(
-        description="whether `/` separates the levels of place labels"
-    )
-    place_labels_are_automatic: bool = Field(
-        description="whether evaluations decide that by the labels"
-    )
-    rows: RowType = Field(
-        validation_alias="row_type",
-        description="type of the stored descriptors, `float32` or `float16`, of new generations; "
-        "GET /generations has the one of each generation",
-    )
-    auto_fit: bool = Field(description=AUTO_FIT)
-    matching: Matching = Field(description=MATCHING)
-    local_features: LocalFeaturesResponse | None = Field(
-        description="local features of the active generation; null before the first photo"
-    )
-    model_change_id: UUID | None = Field(description="job of the running model change")
-    next_fit_photos: int | None = Field(
-        description="number of photos from which the next vocabulary is fitted automatically; null "
-        "if none is"
-    )
-    created_at: datetime
-
-
-class DeletedMapResponse(ResponseModel):
-    success: bool
-    message: str
-    deleted_map: str
 
 
 @router.get("/maps", operation_id="list_maps", dependencies=[READ])
@@ -221,6 +153,7 @@ def create_new_map(
             row_type=body.rows or RowType(settings.descriptor_rows),
             auto_fit=body.auto_fit,
             matching=body.matching,
+            elsewhere=body.elsewhere,
         )
         response = _map_response(session, settings, map_)
         idempotent.store_response(session, 201, response)
@@ -236,7 +169,8 @@ def read_map(gateway: GatewayDep, name: MapNamePath) -> MapResponse:
 
 @router.patch("/maps/{name}", operation_id="update_map", dependencies=[WRITE, CHECK_MAP])
 def update_map(gateway: GatewayDep, name: MapNamePath, body: UpdateMapRequest) -> MapResponse:
-    """Change settings of the map: labels that are paths, stored descriptors, fits, matching.
+    """Change settings of the map: labels that are paths, stored descriptors, fits, matching, and
+    how many queries are from elsewhere.
 
     After a change of the labels, its estimates have no levels until the next evaluation, which
     starts by itself if automatic evaluations are on. A change of `rows` applies to generations that
@@ -261,6 +195,8 @@ def update_map(gateway: GatewayDep, name: MapNamePath, body: UpdateMapRequest) -
             map_.auto_fit = body.auto_fit
         if body.matching is not None:
             map_.matching = body.matching
+        if body.elsewhere is not None:
+            map_.elsewhere = body.elsewhere
         active = active_generation(session, map_.id)
         is_on = body.matching == Matching.ON
         if is_on and active and count_features(session, active.id, detector).missing:
@@ -300,6 +236,7 @@ def _map_response(session: Session, settings: Settings, map_: Map) -> MapRespons
     statistics, counted_at = get_map_statistics(session, map_.id)
     return MapResponse.of_row(
         map_,
+        elsewhere=map_.elsewhere or ELSEWHERE_SHARE,
         photos=statistics.photos,
         searchable=statistics.searchable,
         failed_photos=statistics.failed_photos,

@@ -15,11 +15,7 @@ from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import NO_NUL_PATTERN, GatewayContext, GatewayDep, MapQuery
 from services.gateway.idempotency import IdempotentDep, IdempotentFormDep, IdempotentRequest
 from services.gateway.json_bodies import JsonRoute
-from services.gateway.schemas import (
-    GenerationResponse,
-    JobAcceptedResponse,
-    VocabularyResponse,
-)
+from services.gateway.responses import JobAcceptedResponse
 from services.gateway.uploads.multipart import FormFile, multipart_schema, receive_form_file
 from shared.catalog.chunks import estimate_described
 from shared.catalog.generations import list_generations
@@ -39,6 +35,7 @@ from shared.http.request_model import RequestModel
 from shared.jobs import Job, JobKind
 from shared.jobs.model_changes import start_model_change
 from shared.jobs.wakeups import JobMessage
+from shared.responses.maps import GenerationResponse, VocabularyResponse
 from shared.storage.keys import new_vocabulary_key
 from shared.storage.vocabulary_npz import encode_vocabulary_file
 

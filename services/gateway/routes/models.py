@@ -7,11 +7,9 @@ validates it (`services.extractor.added_models`).
 from __future__ import annotations
 
 import re
-from datetime import datetime
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Request
-from pydantic import Field
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
@@ -27,7 +25,7 @@ from services.gateway.dependencies import (
 )
 from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
 from services.gateway.json_bodies import JsonRoute
-from services.gateway.schemas import JobAcceptedResponse, ResponseModel
+from services.gateway.responses import JobAcceptedResponse
 from services.gateway.uploads.multipart import FormFile, multipart_schema, receive_form_file
 from shared.catalog.maps import get_map
 from shared.catalog.models import (
@@ -46,6 +44,8 @@ from shared.extractor_config.names import (
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
 from shared.jobs.wakeups import JobMessage
+from shared.responses import ResponseModel
+from shared.responses.maps import ModelResponse, RemovedModelResponse
 from shared.storage.keys import new_checkpoint_key
 
 # The largest backbone (ViT-g) has 4.5 GB of weights. Only admins add models.
@@ -80,51 +80,20 @@ ModelNamePath = Annotated[
 ]
 
 
-class ModelResponse(ResponseModel):
-    name: str = Field(validation_alias="added_name")
-    extractor: str = Field(
-        description="extractor name that maps use: gsv:NAME, torchscript:NAME:OPTIONS"
+def _model_response(session: Session, model: Model) -> ModelResponse:
+    config = model.config or {}
+    maps = list_maps_using_model(session, model)
+    return ModelResponse.of_row(
+        model,
+        config=config,
+        extractor=config.get("extractor", model.name),
+        image_size=config.get("image_size"),
+        maps=maps,
     )
-    fingerprint: str = Field(description="SHA-256 of its configuration and weights")
-    dimension: int = Field(description="dimension of its descriptors, or of a patch's feature")
-    image_size: tuple[int, int] | None = Field(
-        description="height and width that photos are resized to; null: their own"
-    )
-    config: dict[str, Any] = Field(
-        description="configuration of backbone and aggregator; of a TorchScript or ONNX file the "
-        "name of the extractor"
-    )
-    size_bytes: int = Field(description="size of its file in the object store")
-    sha256: str = Field(description="SHA-256 of that file")
-    licence: str
-    note: str | None
-    about: dict[str, Any] = Field(
-        validation_alias="card", description="source file and training details"
-    )
-    added_at: datetime
-    maps: list[str] = Field(description="maps that use it")
-
-    @classmethod
-    def of(cls, session: Session, model: Model) -> ModelResponse:
-        config = model.config or {}
-        maps = list_maps_using_model(session, model)
-        return cls.of_row(
-            model,
-            config=config,
-            extractor=config.get("extractor", model.name),
-            image_size=config.get("image_size"),
-            maps=maps,
-        )
 
 
 class ModelsResponse(ResponseModel):
     models: list[ModelResponse]
-
-
-class RemovedModelResponse(ResponseModel):
-    success: bool
-    message: str
-    removed_model: str
 
 
 @router.post(
@@ -189,7 +158,7 @@ def _queue_model(
 def read_models(gateway: GatewayDep) -> ModelsResponse:
     """List the added models by name."""
     with gateway.catalog.read() as session:
-        models = [ModelResponse.of(session, model) for model in list_registered_models(session)]
+        models = [_model_response(session, model) for model in list_registered_models(session)]
     return ModelsResponse(models=models)
 
 
@@ -199,7 +168,7 @@ def read_models(gateway: GatewayDep) -> ModelsResponse:
 def read_model(gateway: GatewayDep, name: ModelNamePath) -> ModelResponse:
     """Get one model."""
     with gateway.catalog.read() as session:
-        return ModelResponse.of(session, get_registered_model(session, name))
+        return _model_response(session, get_registered_model(session, name))
 
 
 @router.delete("/models/{name}", operation_id="remove_model", dependencies=[ADMIN, NO_PARAMETERS])

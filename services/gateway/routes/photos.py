@@ -29,13 +29,7 @@ from services.gateway.dependencies import (
 )
 from services.gateway.json_bodies import JsonRoute
 from services.gateway.photo_search import MAX_COUNTED_MATCHES, MetadataFilter, search_photos
-from services.gateway.schemas import (
-    DeletedPhotoResponse,
-    JobAcceptedResponse,
-    MetadataSearchResponse,
-    PhotoDetailResponse,
-    PhotoResponse,
-)
+from services.gateway.responses import JobAcceptedResponse, MetadataSearchResponse, photo_response
 from services.gateway.similarity.search_params import (
     FilterParams,
     parse_optional_time,
@@ -63,6 +57,8 @@ from shared.ingest.photo_metadata import (
 from shared.jobs import Job, JobKind, JobState, Priority
 from shared.jobs.transitions import cancel_jobs, requeue_job_as_new
 from shared.jobs.wakeups import JobMessage
+from shared.responses.jobs import DeletedPhotoResponse
+from shared.responses.similarity import PhotoDetailResponse, PhotoResponse
 from shared.storage.keys import preview_key, thumbnail_key
 
 router = APIRouter(tags=["photos"], route_class=JsonRoute)
@@ -340,7 +336,7 @@ def search_photos_by_metadata(
     return MetadataSearchResponse(
         total_found=total,
         total_is_exact=total < MAX_COUNTED_MATCHES,
-        images=[PhotoResponse.of(photo, query.map) for photo in page],
+        images=[photo_response(PhotoResponse, photo, query.map) for photo in page],
         next_cursor=next_cursor,
         query_time_ms=(time.perf_counter() - started) * 1000,
     )
@@ -349,7 +345,7 @@ def search_photos_by_metadata(
 def _photo_detail_response(session: Session, photo: Photo, map_name: str) -> PhotoDetailResponse:
     generation = active_generation(session, photo.map_id)
     searchable = generation is not None and find_descriptor(session, generation.id, photo.id)
-    return PhotoDetailResponse.of(photo, map_name, searchable=bool(searchable))
+    return photo_response(PhotoDetailResponse, photo, map_name, searchable=bool(searchable))
 
 
 def _read_blocks(file: BinaryIO) -> Iterator[bytes]:

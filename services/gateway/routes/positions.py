@@ -12,7 +12,6 @@ from pydantic import AwareDatetime, ConfigDict, Field, model_validator
 from services.gateway.authentication import READ
 from services.gateway.dependencies import NO_PARAMETERS, GatewayDep, MapQuery
 from services.gateway.json_bodies import JsonRoute
-from services.gateway.schemas import ResponseModel
 from shared.catalog.chunks import count_searchable
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
@@ -32,6 +31,8 @@ from shared.http.request_model import FailFastList, RequestModel
 from shared.imaging.capture_place import is_null_island
 from shared.imaging.photo_header import read_photo_header
 from shared.ingest.photo_metadata import coordinate_pair
+from shared.responses import ResponseModel
+from shared.responses.reconstructions import PhotoHeaderResponse, ProposalResponse
 from shared.tracks.motion import motion_model
 
 router = APIRouter(tags=["photos"], route_class=JsonRoute)
@@ -49,27 +50,6 @@ Longitude = Annotated[float, Field(ge=-180, le=180)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Name = Annotated[str, Field(max_length=MAX_NAME)]
 ClockOffset = Annotated[timedelta, Field(ge=timedelta(days=-1), le=timedelta(days=1))]
-
-
-class PhotoHeaderResponse(ResponseModel):
-    """What a photo's header says about when, where and by which camera it was taken."""
-
-    captured_at: AwareDatetime | None = Field(
-        description="UTC; if `time_zone_is_known` is false, the camera's clock as if it were UTC"
-    )
-    time_zone_is_known: bool
-    camera: str | None = Field(description="make, model, owner and serial number")
-    camera_is_unique: bool = Field(description="`camera` contains a serial number or an owner")
-    clock_offset: timedelta | None = Field(
-        description="of the camera's clock from UTC, by its tag or the GPS time"
-    )
-    latitude: float | None
-    longitude: float | None
-    gps_error: str | None = Field(
-        description="why the photo may have coordinates although none are known: a tag that is not "
-        "understood, or metadata behind the bytes that were sent; propose none for it"
-    )
-    focal_length: float | None = Field(description="as a multiple of the photo's longer side")
 
 
 class _Finite(RequestModel):
@@ -110,6 +90,7 @@ class SearchBody(_Finite):
     circles: list[CircleBody] = Field(max_length=10, description="finest first")
     not_in_map: Probability
     pose: PoseBody | None = None
+    headline: str = Field("", max_length=MAX_NAME, description="of the estimate")
 
 
 class DatedPhotoBody(_Finite):
@@ -164,21 +145,6 @@ class PositionsBody(_Finite):
         if sum(photo.latitude is None for photo in self.photos) > MAX_UNLOCATED:
             raise ValueError(f"send at most {MAX_UNLOCATED} photos without coordinates")
         return self
-
-
-class ProposalResponse(ResponseModel):
-    """Where a photo was probably taken."""
-
-    name: str
-    latitude: float | None = Field(description="null if nothing is known about its place")
-    longitude: float | None
-    radius_m: float
-    probability: float = Field(description="that it was taken within `radius_m`")
-    radius_68_m: float | None
-    heading: float | None = Field(
-        None, description="degrees clockwise from north; null unless the proposal rests on a pose"
-    )
-    reason: str
 
 
 class ProposalsResponse(ResponseModel):
@@ -244,8 +210,9 @@ def propose_positions(
         on_track = None
         if photo.time is not None and photo.time_zone_is_known:
             on_track = interpolate_position(track, photo.time, speed)
+        picture = _picture_evidence(sent.search, photo_count)
         proposal = propose_position(
-            _picture_evidence(sent.search, photo_count),
+            picture,
             neighbours.position_of(photo, speed),
             on_track,
             body.radius_m,
@@ -259,7 +226,7 @@ def propose_positions(
                 probability=proposal.probability if proposal else 0.0,
                 radius_68_m=proposal.radius_68_m if proposal else None,
                 heading=proposal.heading if proposal else None,
-                reason=proposal.reason if proposal else neighbours.why_unknown(photo),
+                reason=proposal.reason if proposal else neighbours.why_unknown(photo, picture),
             )
         )
     return ProposalsResponse(proposals=proposals)
@@ -280,4 +247,5 @@ def _picture_evidence(search: SearchBody | None, photo_count: int) -> PictureEvi
         search.not_in_map,
         photo_count,
         PosePosition(**search.pose.model_dump()) if search.pose else None,
+        search.headline,
     )

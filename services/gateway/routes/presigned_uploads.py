@@ -39,6 +39,7 @@ from services.gateway.dependencies import (
 )
 from services.gateway.idempotency import IdempotentDep, IdempotentReplay, delete_if_refused
 from services.gateway.json_bodies import JsonRoute
+from services.gateway.responses import accepted_headers, url_in_map
 from services.gateway.routes.photos import PhotoUpdate
 from services.gateway.routes.uploads import (
     UPLOAD_RESPONSES,
@@ -46,7 +47,6 @@ from services.gateway.routes.uploads import (
     finish_upload,
     wait_for_description,
 )
-from services.gateway.schemas import ResponseModel, UploadResponse, accepted_headers, url_in_map
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.idempotency import StoredResponse
 from shared.catalog.maps import get_map
@@ -62,6 +62,8 @@ from shared.ingest.validation import (
     file_too_large_error,
     validate_photo,
 )
+from shared.responses import ResponseModel
+from shared.responses.jobs import UploadResponse
 from shared.storage import ObjectInfo, PresigningStore
 from shared.storage.keys import incoming_key, new_original_key
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import tarfile
 from collections import Counter
 from collections.abc import Iterator
-from datetime import datetime
 from typing import Any
 from uuid import UUID
 
@@ -20,7 +19,7 @@ from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import GatewayContext, GatewayDep, MapQuery, ReconstructionId
 from services.gateway.idempotency import IdempotentDep, IdempotentRequest
 from services.gateway.json_bodies import JsonRoute
-from services.gateway.schemas import JobAcceptedResponse, ResponseModel
+from services.gateway.responses import JobAcceptedResponse
 from shared.catalog.database.base import get_in_map
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import get_map, lock_map
@@ -38,6 +37,12 @@ from shared.http.request_model import RequestModel
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
 from shared.jobs.wakeups import JobMessage
+from shared.responses import ResponseModel
+from shared.responses.reconstructions import (
+    ComponentResponse,
+    CoordinateProposalResponse,
+    ReconstructionResponse,
+)
 from shared.storage.keys import new_checkpoint_key
 
 router = APIRouter(tags=["reconstructions"], route_class=JsonRoute)
@@ -66,81 +71,19 @@ class ReconstructRequest(RequestModel):
 FIT = {"agreeing", "located", "is_on_line"}
 
 
-class ComponentResponse(ResponseModel):
-    """Photos that were reconstructed together, in a frame of their own."""
-
-    number: int
-    photos: int
-    points: int
-    mean_reprojection_error_pixels: float = Field(
-        description="of photos whose longer side has 640 pixels"
+def _component_response(component: ReconstructedComponent) -> ComponentResponse:
+    alignment = component.alignment
+    latitude, longitude, altitude = alignment.origin if alignment else (None, None, None)
+    similarity = alignment.similarity if alignment else {}
+    return ComponentResponse.of_row(
+        component,
+        latitude=latitude,
+        longitude=longitude,
+        altitude_m=altitude if similarity.get("knows_altitude") else None,
+        metres_per_unit=similarity.get("scale"),
+        alignment_rms_m=alignment and alignment.rms_m,
+        **(alignment.model_dump(include=FIT) if alignment else dict.fromkeys(FIT)),
     )
-    latitude: float | None = Field(
-        description="of the middle of its photos; null if it is not aligned"
-    )
-    longitude: float | None
-    altitude_m: float | None = Field(description="null also if its photos have no altitudes")
-    metres_per_unit: float | None = Field(description="metres in a unit of its frame")
-    alignment_rms_m: float | None = Field(
-        description="root mean square distance between the photos that agree and their coordinates"
-    )
-    agreeing: int | None = Field(description="photos that agree with their coordinates")
-    located: int | None = Field(description="photos that have coordinates")
-    is_on_line: bool | None = Field(
-        description="whether its photos are on a line: upright cameras settle the turn about it"
-    )
-    not_aligned: str | None = Field(description="why it is not aligned")
-    calibration: dict[str, Any] | None = Field(
-        description="errors of the poses of its own photos, each found again without itself, in "
-        "standard deviations (`position_68`, `position_95`, `heading_68`, `heading_95`), the share "
-        "that was found (`share_found`), and the number of `poses` that this rests on"
-    )
-
-    @classmethod
-    def of(cls, component: ReconstructedComponent) -> ComponentResponse:
-        alignment = component.alignment
-        latitude, longitude, altitude = alignment.origin if alignment else (None, None, None)
-        similarity = alignment.similarity if alignment else {}
-        return cls.of_row(
-            component,
-            latitude=latitude,
-            longitude=longitude,
-            altitude_m=altitude if similarity.get("knows_altitude") else None,
-            metres_per_unit=similarity.get("scale"),
-            alignment_rms_m=alignment and alignment.rms_m,
-            **(alignment.model_dump(include=FIT) if alignment else dict.fromkeys(FIT)),
-        )
-
-
-class ReconstructionResponse(ResponseModel):
-    reconstruction_id: UUID = Field(validation_alias="id")
-    job_id: UUID
-    generation_id: UUID
-    map_version: int = Field(description="version of the map when its photos were read")
-    features_model: str = Field(description="model of the local features that it is made of")
-    imported: bool = Field(description="whether its poses come from an imported COLMAP model")
-    components: list[ComponentResponse] = Field(description="largest first")
-    proposals: int = Field(
-        description="number of photos whose coordinates disagree with it, without accepted ones: "
-        "`GET /reconstructions/{reconstruction_id}/proposals`"
-    )
-    created_at: datetime
-    finished_at: datetime
-
-
-class CoordinateProposalResponse(ResponseModel):
-    """A photo whose coordinates disagree with the reconstruction."""
-
-    image_id: UUID
-    original_filename: str
-    relative_path: str | None
-    latitude: float = Field(description="when it was reconstructed")
-    longitude: float
-    proposed_latitude: float
-    proposed_longitude: float
-    distance_m: float = Field(description="between both")
-    radius_95_m: float = Field(description="that contains the true place with 95 %")
-    accepted: bool = Field(description="whether the photo has the proposed coordinates now")
 
 
 class CoordinateProposalsResponse(ResponseModel):
@@ -240,7 +183,7 @@ def read_reconstruction(gateway: GatewayDep, query: MapQuery) -> ReconstructionR
             raise NotFound("no_reconstruction", found)
         return ReconstructionResponse.of_row(
             found,
-            components=list(map(ComponentResponse.of, found.list_components())),
+            components=list(map(_component_response, found.list_components())),
             proposals=sum(not each.accepted for each in _list_proposals(session, found)),
         )
 

@@ -23,7 +23,7 @@ from services.gateway.dependencies import (
 )
 from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
 from services.gateway.json_bodies import JsonRoute
-from services.gateway.schemas import JobAcceptedResponse, SimilarityResponse
+from services.gateway.responses import JobAcceptedResponse
 from services.gateway.similarity.execute import find_similar, query_from_job, query_from_photo
 from services.gateway.similarity.geopose import (
     GEOPOSE,
@@ -57,6 +57,7 @@ from shared.imaging.photo_header import read_photo_header
 from shared.ingest.validation import check_photo_signature
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.wakeups import JobMessage
+from shared.responses.similarity import SimilarityResponse
 from shared.storage.keys import query_key, query_preview_key
 
 router = APIRouter(tags=["similarity"], route_class=JsonRoute)

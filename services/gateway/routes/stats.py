@@ -2,43 +2,20 @@
 
 from __future__ import annotations
 
-from datetime import datetime
-from uuid import UUID
-
 from fastapi import APIRouter
-from pydantic import Field
 from sqlalchemy import func, select
 
 from services.gateway.authentication import READ
 from services.gateway.dependencies import GatewayDep, MapQuery, PageQuery
-from services.gateway.schemas import ResponseModel
 from shared.catalog.chunks import Chunk
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map, get_map_statistics, list_searches
 from shared.catalog.processes import list_processes
 from shared.catalog.vocabularies import next_fit_photos, vocabulary_standing
+from shared.responses import ResponseModel
+from shared.responses.maps import SearchHistoryEntry, StatsResponse
 
 router = APIRouter(tags=["operations"])
-
-
-class SearchHistoryEntry(ResponseModel):
-    search_id: UUID = Field(validation_alias="id")
-    query_file_id: UUID | None = Field(
-        validation_alias="query_photo_id", description="null when the query photo is not stored"
-    )
-    query_filename: str
-    generation_id: UUID
-    top_k: int
-    results: int
-    best_score: float | None
-    in_map: bool | None = Field(description="`estimate.in_map` of the response")
-    answer_level: int | None = Field(description="`estimate.answer_level` of the response")
-    not_in_map_probability: float | None = Field(
-        description="`estimate.not_in_map_probability` of the response; null if it had no levels"
-    )
-    has_place: bool = Field(description="`estimate.has_place` of the response")
-    processing_time_ms: float = Field(validation_alias="processing_ms")
-    searched_at: datetime
 
 
 class SearchHistoryResponse(ResponseModel):
@@ -57,38 +34,6 @@ def read_searches(gateway: GatewayDep, query: PageQuery) -> SearchHistoryRespons
         searches=[SearchHistoryEntry.model_validate(search) for search in page],
         next_cursor=next_cursor,
     )
-
-
-class StatsResponse(ResponseModel):
-    map: str
-    map_version: int
-    total_images: int = Field(validation_alias="photos")
-    searchable_images: int = Field(validation_alias="searchable")
-    failed_images: int = Field(
-        validation_alias="failed_photos",
-        description="stored photos that can't be searched for, because their description failed",
-    )
-    labelled_queries: int
-    total_chunks: int
-    total_storage_bytes: int
-    feature_dimension: int | None
-    max_images_per_chunk: int
-    extractor: str
-    device: str | None = Field(
-        description="where extractors compute, `cpu` or `cuda`; null while none is running"
-    )
-    vocabulary: str | None
-    next_fit_photos: int | None = Field(
-        description="number of photos from which the next vocabulary is fitted automatically; null "
-        "if none is"
-    )
-    total_searches: int = Field(validation_alias="searches")
-    recent_uploads_24h: int = Field(validation_alias="uploads_24h")
-    recent_searches_24h: int = Field(validation_alias="searches_24h")
-    avg_processing_time_ms: float | None = Field(validation_alias="average_ms")
-    max_processing_time_ms: float | None = Field(validation_alias="longest_ms")
-    jobs: dict[str, int]
-    counted_at: datetime = Field(description="when the statistics were computed")
 
 
 @router.get("/database/stats", operation_id="database_stats", dependencies=[READ])

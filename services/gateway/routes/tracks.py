@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from datetime import datetime, timedelta
+from datetime import timedelta
 from typing import Annotated, Any, Literal
 from uuid import UUID
 
@@ -38,13 +38,12 @@ from services.gateway.idempotency import (
     IdempotentRequest,
 )
 from services.gateway.json_bodies import JsonRoute
-from services.gateway.schemas import ResponseModel, accepted_headers, job_url, url_in_map
+from services.gateway.responses import accepted_headers, job_url, url_in_map
 from services.gateway.similarity.search_params import SearchParams
 from services.gateway.tracks.apply_frames import apply_pending_frames, smooth_states
 from services.gateway.tracks.schemas import (
     FRAME_FIELDS,
     TrackParams,
-    TrackStateResponse,
     parse_frame_form,
 )
 from services.gateway.uploads.multipart import FormFile, multipart_schema
@@ -70,65 +69,23 @@ from shared.errors import Conflict
 from shared.ids import new_id
 from shared.imaging.photo_header import read_photo_header
 from shared.jobs.wakeups import JobMessage
+from shared.responses import ResponseModel
+from shared.responses.tracks import (
+    DeletedTrackResponse,
+    TrackDetailResponse,
+    TrackFrameResponse,
+    TrackResponse,
+    TrackStateResponse,
+)
 
 router = APIRouter(tags=["tracks"], route_class=JsonRoute)
 
 APPLY_SECONDS = 5.0  # of one read; frames that remain pending are applied by the next one
 
 
-class TrackResponse(ResponseModel):
-    """A track with its last state."""
-
-    track_id: UUID
-    motion: str | None
-    max_speed_mps: float | None
-    version: int = Field(
-        description="number of accepted frames; a frame with this `expected_version` is accepted "
-        "only if no other client has added one"
-    )
-    pending: int = Field(description="accepted frames that are not applied yet")
-    state: TrackStateResponse | None = Field(description="after the last applied frame")
-    created_at: datetime
-    updated_at: datetime = Field(description="when the last frame was accepted")
-    expires_at: datetime = Field(description="the track is deleted then, unless a frame is added")
-
-
 class TracksResponse(ResponseModel):
     tracks: list[TrackResponse]
     next_cursor: str | None
-
-
-class TrackFrameResponse(ResponseModel):
-    """A frame of a track."""
-
-    frame_id: UUID
-    captured_at: datetime
-    filename: str
-    status: Literal["pending", "applied", "failed"] = Field(
-        description="`pending` until the photo is described and all earlier frames are applied; "
-        "`failed`: the photo could not be described, and the track continues without it"
-    )
-    state: TrackStateResponse | None = Field(
-        description="the state of the track after this frame; frames that arrive late change it"
-    )
-    error: dict[str, Any] | None = Field(description="an RFC 9457 problem")
-    job_id: UUID
-    job_url: str
-    frame_url: str
-    version: int = Field(description="of the track when the frame was accepted")
-
-
-class TrackDetailResponse(TrackResponse):
-    """A track with all frames, in the order of their times."""
-
-    smoothed: bool
-    frames: list[TrackFrameResponse]
-
-
-class DeletedTrackResponse(ResponseModel):
-    success: bool
-    message: str
-    deleted_track_id: UUID
 
 
 class TrackReadParams(MapParams):

@@ -24,7 +24,7 @@ from services.gateway.dependencies import (
     wait_for_job,
 )
 from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
-from services.gateway.schemas import UploadResponse, accepted_headers, url_in_map
+from services.gateway.responses import accepted_headers, url_in_map
 from services.gateway.uploads.multipart import (
     MAX_FIELDS_BYTES,
     FormFile,
@@ -39,6 +39,7 @@ from shared.ingest.store_photo import StoreResult, insert_photo
 from shared.ingest.validation import check_photo_signature, validate_photo
 from shared.jobs import Job, JobState
 from shared.jobs.wakeups import JobMessage
+from shared.responses.jobs import UploadResponse
 from shared.storage.keys import new_original_key
 
 router = APIRouter(tags=["photos"])

@@ -12,7 +12,6 @@ from pydantic import Field, model_validator
 from services.gateway.authentication import ADMIN
 from services.gateway.dependencies import NO_PARAMETERS, GatewayDep, PageParams, WebhookId
 from services.gateway.json_bodies import JsonRoute
-from services.gateway.schemas import ResponseModel
 from shared.catalog.webhooks import (
     Delivery,
     DeliveryState,
@@ -25,6 +24,7 @@ from shared.catalog.webhooks import (
 )
 from shared.errors import PlacewiseError, invalid_field_error
 from shared.http.request_model import RequestModel
+from shared.responses import ResponseModel
 from shared.security.webhook_targets import parse_webhook_url, resolve_webhook_target
 
 router = APIRouter(tags=["administration"], route_class=JsonRoute)

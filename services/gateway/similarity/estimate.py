@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from uuid import UUID
 
-from services.gateway.schemas import CameraPoseResponse, EstimateLevelResponse, EstimateResponse
 from shared.catalog.photos import Photo
 from shared.evaluation.places.evidence import PhotoLocation, RankedPhoto
 from shared.evaluation.places.probability import PlaceEstimate
+from shared.responses.similarity import CameraPoseResponse, EstimateLevelResponse, EstimateResponse
 from shared.search_api.protocol import SearchHit
 
 POSE_SHARES = (("radius_95_m", 0.95), ("radius_68_m", 0.68))
@@ -52,6 +52,7 @@ def estimate_place(
             longitude=spot.longitude,
             place=spot.place,
             has_place=True,
+            elsewhere=elsewhere,
             headline="Best guess. How certain it is has not been measured yet.",
             reason=NOT_MEASURED,
         )

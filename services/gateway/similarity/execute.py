@@ -17,13 +17,7 @@ from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from services.gateway.dependencies import GatewayContext
-from services.gateway.schemas import (
-    CameraPoseResponse,
-    EstimateResponse,
-    SimilarityResponse,
-    SimilarPhotoResponse,
-    job_url,
-)
+from services.gateway.responses import job_url, photo_response
 from services.gateway.similarity.estimate import estimate_place, locate_hits, place_at_pose
 from services.gateway.similarity.matches import (
     MATCHING_IS_OFF,
@@ -43,8 +37,14 @@ from shared.catalog.vocabularies import vocabulary_standing
 from shared.errors import Conflict, Gone, StorageFull
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH, RankedPhoto
 from shared.evaluation.places.levels import LevelScheme
-from shared.evaluation.places.probability import PlaceModel
+from shared.evaluation.places.probability import ELSEWHERE_SHARE, PlaceModel
 from shared.jobs import Job, JobState
+from shared.responses.similarity import (
+    CameraPoseResponse,
+    EstimateResponse,
+    SimilarityResponse,
+    SimilarPhotoResponse,
+)
 from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
 from shared.search_api.protocol import (
     FeatureReference,
@@ -197,23 +197,9 @@ def run_similarity_search(
     if isinstance(pose, CameraPoseResponse):
         estimate = place_at_pose(estimate, pose)
     hits = matches.rerank(similar.hits, search_params.rerank or 0)[: search_params.top_k]
-    response = SimilarityResponse.of_row(
-        similar.response,
-        query_file_id=query.photo_id,
-        query_filename=query.filename,
-        processing_time_ms=(time.perf_counter() - started) * 1000,
-        total_similar=0,
-        similar_images=[],
-        estimate=estimate,
-        matches=matches.response,
-        pose=None if isinstance(pose, str) else pose,
-        no_pose=pose if isinstance(pose, str) else None,
-        vocabulary=query.vocabulary,
-        generation_id=query.generation.id,
-        rows=RowType(query.generation.row_type),
-        degraded=bool(similar.response.missing),
-    ).with_photos(
-        SimilarPhotoResponse.of(
+    images = [
+        photo_response(
+            SimilarPhotoResponse,
             similar.photos[hit.photo_id],
             query.map.name,
             similarity_score=hit.score,
@@ -222,6 +208,23 @@ def run_similarity_search(
             pairs=matches.pairs(hit.photo_id) if search_params.explain else None,
         )
         for hit in hits
+    ]
+    response = SimilarityResponse.of_row(
+        similar.response,
+        query_file_id=query.photo_id,
+        query_filename=query.filename,
+        processing_time_ms=(time.perf_counter() - started) * 1000,
+        total_similar=len(images),
+        similar_images=images,
+        matches_without_place=sum(one.latitude is None and one.place is None for one in images),
+        estimate=estimate,
+        matches=matches.response,
+        pose=None if isinstance(pose, str) else pose,
+        no_pose=pose if isinstance(pose, str) else None,
+        vocabulary=query.vocabulary,
+        generation_id=query.generation.id,
+        rows=RowType(query.generation.row_type),
+        degraded=bool(similar.response.missing),
     )
     return response, _make_history(query, search_params, rankings.found, response)
 
@@ -370,6 +373,7 @@ def _estimate(
     found, whole_map = rankings.found, rankings.whole_map
     model, scheme = _place_model(search)
     certainty = search_params.certainty or settings.certainty
+    elsewhere = search_params.elsewhere or query.map.elsewhere or ELSEWHERE_SHARE
     neighbours = search.rank_neighbours(whole_map.hits[0].photo_id) if whole_map.hits else ()
     places = model.estimate(
         matches.add_to(whole_map.ranking),
@@ -378,13 +382,13 @@ def _estimate(
         certainty,
         settings.estimate_radius_m,
         matches.add_to(rankings.located.ranking),
-        search_params.elsewhere,
+        elsewhere,
     )
     similar = locate_hits(rankings.similar.hits[: search_params.top_k], rankings.similar.photos)
     if not any(ranked.location.is_known for ranked in similar):
         places = None  # the photos that it would be named after do not look like the query
     reason = _no_place_reason(found.hits, search_params.photos)
-    estimate = estimate_place(places, certainty, search_params.elsewhere, reason)
+    estimate = estimate_place(places, certainty, elsewhere, reason)
     if places is None or not model.is_fitted:
         return estimate, {}
     best = (hit.photo_id for hit in rankings.located.hits)

@@ -18,13 +18,14 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic.alias_generators import to_camel
 
-from services.gateway.schemas import CameraPoseResponse, ResponseModel, SimilarityResponse
 from services.gateway.similarity.search_params import SearchParams
 from shared.errors import Unprocessable, invalid_field_error
 from shared.geometry.cameras import Camera
 from shared.geometry.colmap_model import ColmapCamera, Number
 from shared.imaging.photo_header import PhotoHeader
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS
+from shared.responses import ResponseModel
+from shared.responses.similarity import CameraPoseResponse, SimilarityResponse
 from shared.search_api.photo_filter import Circle
 
 MEDIA_TYPE = "application/geopose+json"

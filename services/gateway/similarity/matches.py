@@ -8,19 +8,18 @@ from dataclasses import dataclass, replace
 from uuid import UUID
 
 from services.gateway.dependencies import GatewayContext
-from services.gateway.schemas import MatchesResponse
 from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import find_feature_rows
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map, Matching
 from shared.errors import PlacewiseError, Unprocessable
 from shared.evaluation.places.evidence import RankedPhoto, match_support
+from shared.responses.similarity import MatchesResponse, PointPair
 from shared.search_api.protocol import (
     FeatureReference,
     MatchRequest,
     MatchResponse,
     PhotoMatches,
-    PointPair,
     SearchHit,
 )
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from sqlalchemy import select
 
 from services.gateway.dependencies import GatewayContext
-from services.gateway.schemas import CameraPoseResponse, PoseCameraResponse
 from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import find_feature_rows
 from shared.catalog.maps import Matching
@@ -17,6 +16,7 @@ from shared.catalog.photos import Photo
 from shared.catalog.reconstructions import ReconstructedComponent, current_reconstruction
 from shared.errors import PlacewiseError
 from shared.geometry.cameras import CameraSource
+from shared.responses.similarity import CameraPoseResponse, PoseCameraResponse
 from shared.search_api.protocol import (
     ComponentPose,
     GeographicPose,

@@ -14,7 +14,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from services.gateway.dependencies import MapParams
 from shared.errors import invalid_field_error
-from shared.evaluation.places.probability import ELSEWHERE_SHARE
 from shared.geometry.colmap_model import ColmapCamera
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS, parse_tags, parse_time
 from shared.search_api.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
@@ -173,11 +172,12 @@ class RankingParams(BaseModel):
         description="Focal length of the query's camera in pixels, divided by the photo's longer "
         "side. Default: that of the EXIF, or else it is estimated.",
     )
-    elsewhere: float = Field(
-        ELSEWHERE_SHARE,
+    elsewhere: float | None = Field(
+        None,
         gt=0,
         lt=1,
-        description="Share of your queries that are from elsewhere than the map.",
+        description="Share of your queries that are from elsewhere than the map. Default: the "
+        "map's `elsewhere`.",
     )
     certainty: float | None = Field(
         None,

@@ -18,7 +18,6 @@ from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 from services.gateway.dependencies import GatewayContext
-from services.gateway.schemas import CameraPoseResponse
 from services.gateway.similarity.execute import (
     SimilarityQuery,
     missing_log_odds,
@@ -27,7 +26,7 @@ from services.gateway.similarity.execute import (
 )
 from services.gateway.similarity.pose import find_pose
 from services.gateway.tracks.catalog_graph import CatalogPhotoGraph
-from services.gateway.tracks.schemas import FrameForm, TrackParams, TrackStateResponse
+from services.gateway.tracks.schemas import FrameForm, TrackParams, track_state_response
 from services.gateway.uploads.query_photo import query_expired_error, query_job_search_params
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import Map
@@ -47,6 +46,8 @@ from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
 from shared.geodesy import distances_m
 from shared.jobs import Job, JobState
 from shared.jobs.transitions import requeue_job_as_new
+from shared.responses.similarity import CameraPoseResponse
+from shared.responses.tracks import TrackStateResponse
 from shared.search_api.background import background_frames
 from shared.search_api.protocol import MAX_MATCHED_PHOTOS, RowReference, SearchHit
 from shared.tracks.belief import Belief
@@ -211,7 +212,7 @@ def _advance(
         changed: dict[UUID, dict[str, Any]] = {}
         for frame_id, each in [(frame.id, evidence), *((f.id, _evidence_of(f)) for f in later)]:
             belief = track_filter.advance(belief, each)
-            state = TrackStateResponse.of(track_filter.state(belief))
+            state = track_state_response(track_filter.state(belief))
             changed[frame_id] = {
                 "state": state.model_dump(mode="json"),
                 "belief": belief.to_bytes(),
@@ -261,7 +262,7 @@ def smooth_states(
         evidence = [_evidence_of(frame) for frame in applied]
         states = track_filter.smoothed_states(evidence, _start_belief(graph, track, evidence[0]))
         return {
-            frame.id: TrackStateResponse.of(state)
+            frame.id: track_state_response(state)
             for frame, state in zip(applied, states, strict=True)
         }
 

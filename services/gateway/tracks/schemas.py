@@ -9,10 +9,11 @@ from uuid import UUID
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from services.gateway.dependencies import NO_NUL_PATTERN
-from services.gateway.schemas import EstimateLevelResponse, ResponseModel
 from shared.errors import invalid_field_error
 from shared.http.request_model import RequestModel
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS, parse_time
+from shared.responses.similarity import EstimateLevelResponse
+from shared.responses.tracks import TrackStateResponse
 from shared.tracks.evidence import Odometry, PositionFix
 from shared.tracks.motion import DEFAULT_MOTION, MotionModel, motion_model
 from shared.tracks.state import TrackState
@@ -153,43 +154,17 @@ def parse_frame_form(fields: dict[str, str]) -> FrameForm:
         raise invalid_field_error(name, first["msg"].removeprefix("Value error, ")) from None
 
 
-class TrackStateResponse(ResponseModel):
-    """Where the camera of a track is."""
-
-    status: Literal["converging", "tracking", "lost"] = Field(
-        description="`tracking`: the position or place is probable; `lost`: it was, or the camera "
-        "is probably outside the map; `converging`: not yet"
+def track_state_response(state: TrackState) -> TrackStateResponse:
+    return TrackStateResponse(
+        status=state.status,
+        image_id=None if state.photo is None else UUID(state.photo),
+        latitude=state.latitude,
+        longitude=state.longitude,
+        place=state.place,
+        heading=state.heading,
+        probability=state.probability,
+        levels=[EstimateLevelResponse.model_validate(level) for level in state.levels],
+        radius_68_m=state.radius_68_m,
+        radius_95_m=state.radius_95_m,
+        not_in_map_probability=state.outside,
     )
-    image_id: UUID | None = Field(description="the nearest photo of the map; null if unknown")
-    latitude: float | None
-    longitude: float | None
-    place: str | None
-    heading: float | None = Field(
-        description="of the nearest photo, degrees clockwise from north; null if the map has none"
-    )
-    probability: float = Field(description="that the camera is at the finest level")
-    levels: list[EstimateLevelResponse] = Field(
-        description="finest first, as in the estimate of a single photo"
-    )
-    radius_68_m: float | None = Field(
-        description="radius in metres around the position that contains the true one with a "
-        "probability of 68 %; null without coordinates, or if it exceeds the largest level"
-    )
-    radius_95_m: float | None = Field(description="the same with 95 %")
-    not_in_map_probability: float = Field(description="that the camera is outside the map")
-
-    @classmethod
-    def of(cls, state: TrackState) -> TrackStateResponse:
-        return cls(
-            status=state.status,
-            image_id=None if state.photo is None else UUID(state.photo),
-            latitude=state.latitude,
-            longitude=state.longitude,
-            place=state.place,
-            heading=state.heading,
-            probability=state.probability,
-            levels=[EstimateLevelResponse.model_validate(level) for level in state.levels],
-            radius_68_m=state.radius_68_m,
-            radius_95_m=state.radius_95_m,
-            not_in_map_probability=state.outside,
-        )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from uuid import UUID
 
 from sqlalchemy import delete, select
@@ -65,19 +65,20 @@ def purge_deleted_maps(catalog: Catalog, store: ObjectStore) -> None:
 
 def _purge_next(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     """Delete the next rows of the map with their objects; True when nothing is left to delete."""
-    for purge_rows in (
-        _cancel_jobs,
-        _purge_chunks,
-        _purge_queries,
-        _purge_batches,
-        _purge_reconstructions,
-        _purge_photos,
-        _purge_presigned_uploads,
-        _purge_searches,
-        _purge_tracks,
-    ):
-        if purge_rows(catalog, store, map_id):  # it deleted some; there may be more
-            return False
+    reconstructions = select(Reconstruction).where(Reconstruction.map_id == map_id)
+    steps: tuple[Callable[[], bool], ...] = (
+        lambda: _cancel_jobs(catalog, map_id),
+        lambda: delete_chunks(catalog, store, Generation.map_id == map_id, limit=CHUNKS_PER_STEP),
+        lambda: delete_queries(catalog, store, Job.map_id == map_id),
+        lambda: _purge_batches(catalog, store, map_id),
+        lambda: delete_reconstructions(catalog, store, reconstructions),
+        lambda: _purge_photos(catalog, store, map_id),
+        lambda: delete_presigned_uploads(catalog, store, PresignedUpload.map_id == map_id),
+        lambda: _purge_searches(catalog, map_id),
+        lambda: _purge_tracks(catalog, map_id),
+    )
+    if any(delete_rows() for delete_rows in steps):  # one deleted some; there may be more
+        return False
     _purge_vocabulary_objects(catalog, store, map_id)
     with catalog.write() as session:
         session.execute(delete(CachedMapStatistics).where(CachedMapStatistics.map_id == map_id))
@@ -93,17 +94,9 @@ def _purge_next(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     return True
 
 
-def _cancel_jobs(catalog: Catalog, _store: ObjectStore, map_id: UUID) -> bool:
+def _cancel_jobs(catalog: Catalog, map_id: UUID) -> bool:
     with catalog.write() as session:
         return cancel_jobs(session, Job.map_id == map_id) > 0
-
-
-def _purge_chunks(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
-    return delete_chunks(catalog, store, Generation.map_id == map_id, limit=CHUNKS_PER_STEP)
-
-
-def _purge_queries(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
-    return delete_queries(catalog, store, Job.map_id == map_id)
 
 
 def _purge_batches(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
@@ -145,22 +138,13 @@ def _purge_photos(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     return delete_with_objects(catalog, store, photos, object_keys, delete_rows)
 
 
-def _purge_reconstructions(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
-    of_map = select(Reconstruction).where(Reconstruction.map_id == map_id)
-    return delete_reconstructions(catalog, store, of_map)
-
-
-def _purge_presigned_uploads(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
-    return delete_presigned_uploads(catalog, store, PresignedUpload.map_id == map_id)
-
-
-def _purge_searches(catalog: Catalog, _store: ObjectStore, map_id: UUID) -> bool:
+def _purge_searches(catalog: Catalog, map_id: UUID) -> bool:
     some = select(Search.id).where(Search.map_id == map_id).limit(ROWS_PER_TRANSACTION)
     with catalog.write() as session:
         return affected_rows(session.execute(delete(Search).where(Search.id.in_(some)))) > 0
 
 
-def _purge_tracks(catalog: Catalog, _store: ObjectStore, map_id: UUID) -> bool:
+def _purge_tracks(catalog: Catalog, map_id: UUID) -> bool:
     some = select(Track.id).where(Track.map_id == map_id).limit(TRACKS_PER_TRANSACTION)
     with catalog.write() as session:
         ids = session.scalars(some).all()

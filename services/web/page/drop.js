@@ -1,4 +1,6 @@
-// Files from a drop, a folder of a drop, or the clipboard.
+// Files from a drop, a folder of a drop, the clipboard, or a chooser.
+
+import { h } from "./dom.js";
 
 /** Every file of a drop, folders opened; each with its path from there as `path`. */
 export async function droppedFiles(transfer) {
@@ -50,4 +52,14 @@ export function takesPastes(onfiles, signal) {
     const files = Array.from(event.clipboardData?.files ?? []);
     if (files.length) onfiles(files.map((file) => ({ file, path: file.name })));
   }, { signal });
+}
+
+/** A hidden input of files or of a folder, which a button opens. */
+export function fileChooser(attributes, take) {
+  const input = h("input", { type: "file", multiple: true, class: "hidden", tabindex: "-1", "aria-hidden": "true", ...attributes });
+  input.addEventListener("change", () => {
+    take(Array.from(input.files, (file) => ({ file, path: file.webkitRelativePath || file.name })));
+    input.value = "";
+  });
+  return input;
 }

@@ -10,10 +10,18 @@ AnyLoc runs a complete forward pass and captures the facet with a hook. This mod
 computing the facet; the values are identical.
 The blocks are timm's. Positions are resampled as in Meta's code, on which AnyLoc's published
 vocabularies depend; timm's own resampling gives other features at any size but the training's.
+
+In bfloat16, a second network holds the matrices as bfloat16, so that no pass converts them, and
+each LayerScale in the matrix before it:
+
+    scale * (W x + b) = (diag(scale) W) x + scale * b
+
+Residual sums and norms stay float32.
 """
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import math
 from dataclasses import dataclass
@@ -21,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch.nn import Identity, Linear
+from torch.nn import Conv2d, Identity, Linear, Parameter
 from torch.nn.functional import interpolate
 
 from shared.descriptors.backbones import (
@@ -112,6 +120,7 @@ class Dinov2(Backbone):
             "file": file.path.name,
             "size_bytes": file.path.stat().st_size,
         }
+        self._bfloat16_vit: Any = None
         self._positions: dict[tuple[int, int], torch.Tensor] = {}
 
     @classmethod
@@ -151,10 +160,11 @@ class Dinov2(Backbone):
             raise ValueError(
                 f"{height} x {width} pixels are not a multiple of the patch size {PATCH}"
             )
+        vit = self._vit_for_precision()
         batch = normalise_pixels(pixels.to(self.device), MEAN, STD)
-        patches = self._vit.patch_embed.proj(batch).flatten(2).transpose(1, 2)
-        tokens = self._with_positions(patches, height // PATCH, width // PATCH)
-        *earlier, last = self._vit.blocks
+        patches = vit.patch_embed.proj(batch).flatten(2).transpose(1, 2)
+        tokens = self._with_positions(vit, patches, height // PATCH, width // PATCH)
+        *earlier, last = vit.blocks
         for block in earlier:
             tokens = block(tokens)
         facet = last(tokens) if self.facet == "token" else last.attn.qkv(last.norm1(tokens))
@@ -163,9 +173,22 @@ class Dinov2(Backbone):
     def grid(self, height: int, width: int) -> tuple[int, int]:
         return height // PATCH, width // PATCH
 
-    def _with_positions(self, patches: torch.Tensor, rows: int, columns: int) -> torch.Tensor:
+    def _vit_for_precision(self) -> Any:
+        """Return the network for the current autocast; only the last one used is on the device."""
+        if not torch.is_autocast_enabled(self.device.type):
+            if self._bfloat16_vit is not None:
+                self._bfloat16_vit.cpu()
+            return self._vit.to(self.device)
+        if self._bfloat16_vit is None:
+            self._bfloat16_vit = copy_in_bfloat16(self._vit)
+        self._vit.cpu()
+        return self._bfloat16_vit.to(self.device)
+
+    def _with_positions(
+        self, vit: Any, patches: torch.Tensor, rows: int, columns: int
+    ) -> torch.Tensor:
         """(B, patches, width) -> (B, 1 + registers + patches, width)."""
-        vit, registers = self._vit, self._shape.registers
+        registers = self._shape.registers
         if (rows, columns) not in self._positions:
             patch_positions = vit.pos_embed if registers else vit.pos_embed[:, 1:]
             self._positions[rows, columns] = resample_positions(
@@ -278,3 +301,25 @@ def _slice_qkv(attention: Any, third: int) -> None:
     attention.qkv = Linear(width, width, device="meta").requires_grad_(False)
     parameters = {"weight": joint.weight[rows].clone(), "bias": joint.bias[rows].clone()}
     attention.qkv.load_state_dict(parameters, assign=True)
+
+
+def copy_in_bfloat16(vit: Any) -> Any:
+    """Return a copy with bfloat16 matrices, in which each LayerScale is part of the one before."""
+    matrices = [module for module in vit.modules() if isinstance(module, Linear | Conv2d)]
+    # What deepcopy finds here it does not copy: the float32 matrices are replaced below.
+    copied = copy.deepcopy(vit, {id(matrix.weight): matrix.weight for matrix in matrices})
+    for block in copied.blocks:
+        for branch, scale, last in (("attn", "ls1", "proj"), ("mlp", "ls2", "fc2")):
+            layer_scale = getattr(block, scale)
+            if isinstance(layer_scale, Identity):
+                continue
+            matrix = getattr(getattr(block, branch), last)
+            scaled = layer_scale.gamma.unsqueeze(1) * matrix.weight
+            matrix.weight = Parameter(scaled.bfloat16(), requires_grad=False)
+            matrix.bias = Parameter(layer_scale.gamma * matrix.bias, requires_grad=False)
+            setattr(block, scale, Identity())
+    for module in copied.modules():
+        if isinstance(module, Linear | Conv2d):
+            for name, single in list(module.named_parameters(recurse=False)):
+                setattr(module, name, Parameter(single.bfloat16(), requires_grad=False))
+    return copied

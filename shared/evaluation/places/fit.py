@@ -111,12 +111,8 @@ def fit_place_model(
     impostors = [s for s in own_held_out if s.left_out is not None]
     judged = labelled_held_out or own_held_out
     thresholds = tuple(choose_threshold(judged, certainty) for certainty in CERTAINTIES)
-    model = _fit_coefficients(samples, labelled, scheme, scores).model_copy(
-        update={
-            "thresholds": thresholds,
-            "own_photos": own,
-        }
-    )
+    fitted = _fit_coefficients(samples, labelled, scheme, scores)
+    model = fitted.model_copy(update={"thresholds": thresholds})
     in_map = labelled_held_out or [s for s in own_held_out if s.left_out is None]
     return FittedPlaceModel(model, in_map, impostors)
 
@@ -141,6 +137,7 @@ def _fit_coefficients(
         missing_place=fit_map_estimate(missing_place_table(samples), prior.missing_place),
         elsewhere=_fit_elsewhere(samples, scores),
         extent=scores.extent,
+        own_photos=sum(sample.left_out is None for sample in samples),
         labelled_queries=len(labelled),
     )
 

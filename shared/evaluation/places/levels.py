@@ -371,5 +371,9 @@ def _votes(scores: FloatArray, temperature: float) -> FloatArray:
 
 
 def _log_odds(votes: FloatArray, inside: Mask) -> float:
-    share = votes[inside].sum() / votes.sum()
+    return log_odds(votes[inside].sum() / votes.sum())
+
+
+def log_odds(share: float) -> float:
+    """Return the log-odds of a share of votes or ranks, which are bounded by MIN_SHARE."""
     return float(np.log((share + MIN_SHARE) / (1 - share + MIN_SHARE)))

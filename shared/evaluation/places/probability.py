@@ -41,6 +41,7 @@ from shared.evaluation.places.levels import (
     FloatArray,
     LevelScheme,
     candidate_levels,
+    log_odds,
     order_by_matches,
     photos_inside,
     place_votes,
@@ -86,20 +87,25 @@ class Elsewhere(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     coefficients: Coefficients
-    """intercept, with a prior of one half; of the similarity; of the votes"""
+    """intercept, with a prior of one half; of the similarity; of the lead of the votes"""
     matched: Coefficients
     """the same with matches, and of the logarithm of the largest match support"""
     background: Background | None = None
     """unit of the similarity; None: that of the map"""
 
     def features(self, levels: Sequence[CandidateLevel]) -> FloatArray:
-        """Return the similarity of the best photo, the log-odds of the votes for its place, and,
-        with matches, the logarithm of 1 + the largest match support."""
+        """Return the similarity of the best photo, the lead of its place, and, with matches, the
+        logarithm of 1 + the largest match support.
+
+        The lead is the log-odds of the votes for the place, in excess of those of its share of the
+        ranks where that is more than half: votes say nothing in a map of one place.
+        """
         assert self.background is not None
         finest = levels[0].features
+        lead = finest[0] - max(0.0, log_odds(finest[FEATURES.index("agreement")]))
         similarity = (levels[0].best_score - self.background.mean) / self.background.deviation
         largest = SUPPORT_UNIT * finest[len(FEATURES) :][:2].max(initial=0.0)
-        described = np.array([similarity, finest[0], np.log1p(largest)])
+        described = np.array([similarity, lead, np.log1p(largest)])
         return described if len(finest) > len(FEATURES) else described[:2]
 
     def probability(self, levels: Sequence[CandidateLevel], share: float) -> float:
@@ -252,7 +258,8 @@ class PlaceModel(BaseModel):
     ) -> tuple[list[float], float]:
         """Return the probability of each level, finest first, and that of "not in this map".
 
-        A level contains the finer ones, so the probabilities are made not to decrease.
+        A level contains the finer ones, so the probabilities are made not to decrease. With n own
+        photos and labelled queries, none exceeds (n + 1) / (n + 2).
 
         Args:
             levels: Those of `MapExtent.end_levels`.
@@ -260,13 +267,17 @@ class PlaceModel(BaseModel):
         """
         prior = shipped_prior()
         missing = self.elsewhere.probability(levels, elsewhere) if self.elsewhere else elsewhere
+        # Laplace's rule of succession: so many right ones in a row say no more.
+        observed = self.own_photos + self.labelled_queries
+        most = (observed + 1) / (observed + 2) if self.is_fitted else 1.0
+        missing = max(missing, 1 - most)
         single = [
             1.0
             if level.is_whole_map
             else _probability(self.levels[i] if i < len(self.levels) else prior.level, level)
             for i, level in enumerate(levels)
         ]
-        increasing = (1 - missing) * np.maximum.accumulate(np.array(single))
+        increasing = np.minimum(most, (1 - missing) * np.maximum.accumulate(np.array(single)))
         return increasing.tolist(), missing
 
     def missing_log_odds(

@@ -12,6 +12,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import hashlib
+import io
 import logging
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
@@ -28,54 +29,14 @@ from shared.errors import NotFound, StorageFull, Unavailable
 from shared.storage.keys import TRASH, check_key, check_note_name
 from shared.storage.protocol import ObjectInfo, PresignedPut
 from shared.storage.s3.bucket import NO_SUCH_KEY_CODES, Bucket
-from shared.storage.s3.streams import MultipartUpload, S3Reader, S3Writer, open_object, read_range
+from shared.storage.s3.streams import MultipartUpload, S3Reader, S3Writer, read_range
 
 log = logging.getLogger(__name__)
 
 
-def presign_put(
-    bucket: Bucket, key: str, *, size_bytes: int, sha256: str, expires_seconds: int
-) -> PresignedPut:
-    """Return a presigned PUT without sending a request; `sha256` is hexadecimal."""
-    now, credentials = datetime.now(UTC), bucket.credentials
-    url = bucket.public.build(
-        method="PUT", region=bucket.region, bucket_name=bucket.name, object_name=key
-    )
-    checksum = base64.b64encode(bytes.fromhex(sha256)).decode()
-    signed = {
-        "content-length": str(size_bytes),
-        "host": url.netloc,
-        "x-amz-checksum-sha256": checksum,
-    }
-    credential = signer.get_credential_string(credentials.access_key, now, bucket.region)
-    parameters = {
-        "X-Amz-Algorithm": signer.SIGN_V4_ALGORITHM,
-        "X-Amz-Credential": credential,
-        "X-Amz-Date": to_amz_date(now),
-        "X-Amz-Expires": str(expires_seconds),
-        "X-Amz-SignedHeaders": ";".join(signed),
-    }
-    query = "&".join(f"{name}={queryencode(value)}" for name, value in parameters.items())
-    header_lines = "".join(f"{name}:{value}\n" for name, value in signed.items())
-    canonical_request = (
-        f"PUT\n{url.path}\n{query}\n{header_lines}\n{';'.join(signed)}\nUNSIGNED-PAYLOAD"
-    )
-    scope = credential.removeprefix(f"{credentials.access_key}/")
-    request_hash = hashlib.sha256(canonical_request.encode()).hexdigest()
-    signature = signer.post_presign_v4(
-        f"{signer.SIGN_V4_ALGORITHM}\n{to_amz_date(now)}\n{scope}\n{request_hash}",
-        credentials.secret_key,
-        now,
-        bucket.region,
-    )
-    headers = {"Content-Length": str(size_bytes), "x-amz-checksum-sha256": checksum}
-    return PresignedPut(
-        f"{url._replace(query=query).geturl()}&X-Amz-Signature={signature}", headers
-    )
-
-
 T = TypeVar("T")
 
+BUFFER_BYTES = 64 * 1024
 PROBE_KEY = ".placewise-check"  # of a multipart upload that is created and aborted
 
 
@@ -101,7 +62,7 @@ class S3Store:
             return file.readall()
 
     def open(self, key: str) -> BinaryIO:
-        return open_object(self.bucket, check_key(key))
+        return io.BufferedReader(S3Reader(self.bucket, check_key(key)), BUFFER_BYTES)
 
     def read_range(self, key: str, begin: int, size_bytes: int) -> bytes:
         return read_range(self.bucket, check_key(key), begin, size_bytes)
@@ -153,12 +114,40 @@ class S3Store:
     def presign_put(
         self, key: str, *, size_bytes: int, sha256: str, expires_seconds: int
     ) -> PresignedPut:
-        return presign_put(
-            self.bucket,
-            check_key(key),
-            size_bytes=size_bytes,
-            sha256=sha256,
-            expires_seconds=expires_seconds,
+        bucket, now = self.bucket, datetime.now(UTC)
+        url = bucket.public.build(
+            method="PUT", region=bucket.region, bucket_name=bucket.name, object_name=check_key(key)
+        )
+        checksum = base64.b64encode(bytes.fromhex(sha256)).decode()
+        signed = {
+            "content-length": str(size_bytes),
+            "host": url.netloc,
+            "x-amz-checksum-sha256": checksum,
+        }
+        credential = signer.get_credential_string(bucket.credentials.access_key, now, bucket.region)
+        parameters = {
+            "X-Amz-Algorithm": signer.SIGN_V4_ALGORITHM,
+            "X-Amz-Credential": credential,
+            "X-Amz-Date": to_amz_date(now),
+            "X-Amz-Expires": str(expires_seconds),
+            "X-Amz-SignedHeaders": ";".join(signed),
+        }
+        query = "&".join(f"{name}={queryencode(value)}" for name, value in parameters.items())
+        header_lines = "".join(f"{name}:{value}\n" for name, value in signed.items())
+        canonical_request = (
+            f"PUT\n{url.path}\n{query}\n{header_lines}\n{';'.join(signed)}\nUNSIGNED-PAYLOAD"
+        )
+        scope = credential.removeprefix(f"{bucket.credentials.access_key}/")
+        request_hash = hashlib.sha256(canonical_request.encode()).hexdigest()
+        signature = signer.post_presign_v4(
+            f"{signer.SIGN_V4_ALGORITHM}\n{to_amz_date(now)}\n{scope}\n{request_hash}",
+            bucket.credentials.secret_key,
+            now,
+            bucket.region,
+        )
+        headers = {"Content-Length": str(size_bytes), "x-amz-checksum-sha256": checksum}
+        return PresignedPut(
+            f"{url._replace(query=query).geturl()}&X-Amz-Signature={signature}", headers
         )
 
     def copy(self, source: str, target: str) -> None:

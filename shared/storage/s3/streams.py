@@ -25,12 +25,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-BUFFER_BYTES = 64 * 1024
 RANGE_NOT_SATISFIABLE_CODE = "InvalidRange"
 
 
 class S3Reader(io.RawIOBase):
-    """An unbuffered reader (see `open_object`); every request reads the version first opened."""
+    """An unbuffered reader; every request reads the version first opened."""
 
     def __init__(self, bucket: Bucket, key: str) -> None:
         super().__init__()
@@ -110,11 +109,6 @@ class S3Reader(io.RawIOBase):
         if self._position < self._size:
             response.close()
         response.release_conn()
-
-
-def open_object(bucket: Bucket, key: str) -> io.BufferedReader:
-    """Open the object as a buffered, seekable file; NotFound when it is missing."""
-    return io.BufferedReader(S3Reader(bucket, key), BUFFER_BYTES)
 
 
 def read_range(bucket: Bucket, key: str, begin: int, size_bytes: int) -> bytes:

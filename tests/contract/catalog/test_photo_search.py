@@ -87,37 +87,6 @@ def test_bounds_of_size_are_inclusive_and_large(catalog: Catalog, map_id: UUID) 
     assert found(catalog, map_id, min_file_size=2**40) == {str(2**40)}
 
 
-TAGS = ["night", "it's", 'the "old" one', "日本", "naïve", "a\\b", "50%", "🏠", "[1]", "1", "null"]
-
-
-def test_a_tag_is_matched_exactly(catalog: Catalog, map_id: UUID) -> None:
-    with catalog.write() as session:
-        for tag in TAGS:
-            add_photo(session, map_id, filename=tag, tags=["common", tag])
-            add_photo(session, map_id, filename="longer", tags=[f"{tag}x", f"x{tag}", "Night"])
-        add_photo(session, map_id, filename="none", tags=[])
-    for tag in TAGS:
-        assert found(catalog, map_id, tags=(tag,)) == {tag}
-    assert found(catalog, map_id, tags=("common",)) == set(TAGS)
-    assert found(catalog, map_id, tags=("night", "common")) == {"night"}
-
-
-def test_a_part_of_a_tag_matches_with_tags_like(catalog: Catalog, map_id: UUID) -> None:
-    with catalog.write() as session:
-        for tag in TAGS:
-            add_photo(session, map_id, filename=tag, tags=[f"Before{tag}After", "other"])
-        add_photo(session, map_id, filename="none", tags=["Üben", "50x"])
-    for tag in TAGS:
-        expected = {tag, "[1]"} if tag == "1" else {tag}
-        assert found(catalog, map_id, tags_like=(tag,)) == expected
-    assert found(catalog, map_id, tags_like=("bEFORE",)) == set(TAGS)
-    # Each part may be in another tag; wildcards are ordinary; other letters have their case.
-    assert found(catalog, map_id, tags_like=("NIGHT", "oth")) == {"night"}
-    assert found(catalog, map_id, tags_like=("5_",)) == set()
-    assert found(catalog, map_id, tags_like=("Üb",)) == {"none"}
-    assert found(catalog, map_id, tags_like=("üb",)) == set()
-
-
 def test_filters_work_together_in_one_map_and_role(catalog: Catalog, map_id: UUID) -> None:
     params: dict[str, Any] = {
         "filename": "x.jpg",

@@ -13,9 +13,9 @@ from shared.catalog.database.base import db_now, db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, active_generation
 from shared.catalog.maps import Map, increment_map_version
-from shared.catalog.photos import Photo, count_live_photos, find_same_photo
+from shared.catalog.photos import Photo, count_live_photos
 from shared.ids import new_id
-from tests.support.catalog_rows import add_generation, add_map, add_photo, delete
+from tests.support.catalog_rows import add_generation, add_map, add_photo
 
 MOMENT = datetime(2024, 5, 6, 7, 8, 9, 123456, tzinfo=UTC)
 
@@ -95,25 +95,6 @@ def test_read_sees_one_snapshot_while_others_write(catalog: Catalog, map_id: UUI
     assert before == after == (0, 0)
     with catalog.read() as session:
         assert (count_live_photos(session, map_id), session.scalar(select(Map.version))) == (1, 1)
-
-
-def test_the_same_live_bytes_are_stored_once_in_a_map_and_again_after_deletion(
-    catalog: Catalog, map_id: UUID
-) -> None:
-    with catalog.write() as session:
-        other = add_map(session, "other").id
-        add_photo(session, other, sha256="a" * 64)
-        first = add_photo(session, map_id, sha256="a" * 64).id
-    with pytest.raises(IntegrityError), catalog.write() as session:
-        add_photo(session, map_id, sha256="a" * 64)
-    for _ in range(2):  # deleted ones may lie there in any number
-        delete(catalog, map_id, first)
-        with catalog.write() as session:
-            first = add_photo(session, map_id, sha256="a" * 64).id
-    with catalog.read() as session:
-        found = find_same_photo(session, map_id, "a" * 64, None)
-        assert found is not None
-        assert found.id == first
 
 
 def test_coordinates_come_in_pairs_or_not_at_all(catalog: Catalog, map_id: UUID) -> None:

@@ -11,6 +11,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from services.extractor.decoder_pool import (
     SCHEDULED_PER_PROCESS,
     DecoderPool,
 )
+from services.extractor.decoder_process import decode_into_memory
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, Unavailable, Unprocessable
 from shared.imaging.decode import DecodedPhoto
@@ -160,7 +162,7 @@ def test_too_many_pixels_are_refused_by_the_settings_limit(settings: Settings) -
     assert outcome.code == "too_many_pixels"
 
 
-def test_photo_that_crashes_the_decoder_harms_only_itself(pool: DecoderPool) -> None:
+def test_photo_that_crashes_its_decoder_process_fails_alone(pool: DecoderPool) -> None:
     first, poison, last = pool.decode([GOOD, photo_of(CRASHES), GOOD], POISONED)
     assert f"crashed on this photo {MAX_DECODE_ATTEMPTS} times" in refusal(poison)
     assert is_good(first)
@@ -168,7 +170,7 @@ def test_photo_that_crashes_the_decoder_harms_only_itself(pool: DecoderPool) -> 
     assert is_good(pool.decode([GOOD], POISONED)[0]), "the next batch, too"
 
 
-def test_photo_that_takes_too_long_harms_only_itself(settings: Settings) -> None:
+def test_photo_that_exceeds_the_decoding_timeout_fails_alone(settings: Settings) -> None:
     with pool_with(settings, timeout_seconds=2.0) as pool:
         pool.decode([GOOD], POISONED)
         first, poison, last = pool.decode([GOOD, photo_of(HANGS), GOOD], POISONED)
@@ -177,7 +179,7 @@ def test_photo_that_takes_too_long_harms_only_itself(settings: Settings) -> None
     assert is_good(last)
 
 
-def test_photo_of_allowed_size_but_too_large_for_the_memory_harms_only_itself(
+def test_photo_that_exceeds_the_decoders_memory_limit_fails_alone(
     settings: Settings,
 ) -> None:
     buffer = io.BytesIO()
@@ -189,7 +191,9 @@ def test_photo_of_allowed_size_but_too_large_for_the_memory_harms_only_itself(
     assert is_good(last)
 
 
-def test_child_that_the_machine_kills_costs_no_photo(pool: DecoderPool) -> None:
+def test_photos_of_a_decoder_that_the_system_kills_are_decoded_by_another(
+    pool: DecoderPool,
+) -> None:
     before = in_child(pool, "__import__('os').getpid()")
     os.kill(before, signal.SIGKILL)
     try:
@@ -201,13 +205,37 @@ def test_child_that_the_machine_kills_costs_no_photo(pool: DecoderPool) -> None:
     assert in_child(pool, "__import__('os').getpid()") != before
 
 
-def test_pool_that_broke_is_made_anew(pool: DecoderPool) -> None:
+def test_process_whose_photo_nobody_waits_for_writes_to_no_other_file(
+    pool: DecoderPool, tmp_path: Path
+) -> None:
+    other = tmp_path / "catalog.db"
+    other.write_bytes(b"rows")
+    with other.open("rb") as file:
+        arguments = [bytes, GOOD, file.fileno(), "photo-of-before"]
+        with pytest.raises(FileNotFoundError, match="photo-of-before"):
+            pool._pool.schedule(decode_into_memory, args=arguments).result()
+    assert other.read_bytes() == b"rows"
+
+
+def test_memory_is_released_when_a_batch_ends_early(pool: DecoderPool) -> None:
+    def photos() -> Iterator[bytes]:
+        yield GOOD
+        raise Unavailable("store_unavailable", "The object store is away.")
+
+    pool.decode([GOOD], SQUARE)
+    with pytest.raises(Unavailable, match="away"):
+        pool.decode(photos(), SQUARE)
+    files = [str(file.resolve()) for file in Path("/proc/self/fd").iterdir()]
+    assert not [file for file in files if "photo-" in file]
+
+
+def test_broken_decoder_pool_is_replaced(pool: DecoderPool) -> None:
     pool._pool.stop()  # type: ignore[no-untyped-call]
     pool._pool.join()
     assert is_good(pool.decode([GOOD], SQUARE)[0])
 
 
-def test_children_import_little_and_know_their_limit(pool: DecoderPool) -> None:
+def test_decoder_processes_import_no_torch_and_have_a_memory_limit(pool: DecoderPool) -> None:
     pool.decode([GOOD], SQUARE)
     modules = in_child(pool, "sorted(__import__('sys').modules)")
     assert "shared.imaging.decode" in modules, "the question went to another process"
@@ -217,7 +245,7 @@ def test_children_import_little_and_know_their_limit(pool: DecoderPool) -> None:
     assert limit == (2_000_000_000, 2_000_000_000)
 
 
-def test_closing_ends_the_children(settings: Settings) -> None:
+def test_closing_the_pool_ends_its_processes(settings: Settings) -> None:
     with pool_with(settings) as pool:
         child = in_child(pool, "__import__('os').getpid()")
     assert child not in {process.pid for process in multiprocessing.active_children()}

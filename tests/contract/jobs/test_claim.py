@@ -18,12 +18,8 @@ from shared.catalog.jobs import SINGLE_CLAIM_JOBS, Priority, WaitingFor, get_job
 from shared.errors import NotFound
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.claim import claim_jobs, fair_batch_size
-from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.model_changes import (
     wake_vocabulary_waiters,
-)
-from shared.jobs.transitions import (
-    requeue_job,
 )
 from tests.contract.jobs.jobs import ids, queue, token_of
 from tests.support.catalog_rows import (
@@ -35,7 +31,7 @@ from tests.support.catalog_rows import (
 from tests.support.servers import PostgresServer
 
 
-def test_higher_priority_goes_first_and_then_age(catalog: Catalog, map_id: UUID) -> None:
+def test_jobs_are_claimed_by_priority_then_by_age(catalog: Catalog, map_id: UUID) -> None:
     expected = [
         (JobKind.REINDEX, 4),
         (JobKind.INDEX, 2),
@@ -50,7 +46,7 @@ def test_higher_priority_goes_first_and_then_age(catalog: Catalog, map_id: UUID)
     assert take(catalog) == []
 
 
-def test_a_batch_holds_the_oldest_up_to_its_limit(catalog: Catalog, map_id: UUID) -> None:
+def test_a_claim_takes_the_oldest_jobs_up_to_its_limit(catalog: Catalog, map_id: UUID) -> None:
     waiting = queue(catalog, map_id, 5)
     assert ids(take(catalog, limit=3)) == waiting[:3]
     assert ids(take(catalog, limit=3)) == waiting[3:]
@@ -91,7 +87,7 @@ def test_a_batch_is_of_one_kind_one_map_and_one_generation(catalog: Catalog, map
     assert take(catalog) == []
 
 
-def test_a_job_marked_alone_comes_alone(catalog: Catalog, map_id: UUID) -> None:
+def test_a_job_marked_alone_is_claimed_without_others(catalog: Catalog, map_id: UUID) -> None:
     first = queue(catalog, map_id, 2)
     lonely = queue(catalog, map_id, alone=True)
     last = queue(catalog, map_id, 2)
@@ -104,14 +100,16 @@ def test_a_job_marked_alone_comes_alone(catalog: Catalog, map_id: UUID) -> None:
     assert ids(take(catalog)) == oldest
 
 
-def test_jobs_that_are_as_much_work_as_a_batch_come_alone(catalog: Catalog, map_id: UUID) -> None:
+def test_jobs_of_single_claim_kinds_are_claimed_one_at_a_time(
+    catalog: Catalog, map_id: UUID
+) -> None:
     single = [queue(catalog, map_id, 2, kind=kind) for kind in SINGLE_CLAIM_JOBS]
     taken = [ids(take(catalog, limit=10)) for _ in range(2 * len(single))]
     assert {len(jobs) for jobs in taken} == {1}
     assert sorted(taken) == sorted([job_id] for pair in single for job_id in pair)
 
 
-def test_a_job_that_waits_for_something_is_held_back(catalog: Catalog, map_id: UUID) -> None:
+def test_a_job_with_waiting_for_is_not_claimed(catalog: Catalog, map_id: UUID) -> None:
     waiting = queue(catalog, map_id, 2, waiting_for=WaitingFor.VOCABULARY)
     with catalog.write() as session:
         other = add_map(session, "other").id
@@ -126,7 +124,7 @@ def test_a_job_that_waits_for_something_is_held_back(catalog: Catalog, map_id: U
     assert take(catalog) == [], "waiters of another map and for something else stay"
 
 
-def test_a_job_whose_time_has_not_come_is_held_back(catalog: Catalog, map_id: UUID) -> None:
+def test_a_job_is_not_claimed_before_its_run_after(catalog: Catalog, map_id: UUID) -> None:
     later = queue(catalog, map_id, run_after=db_now_plus(3600))
     due = queue(catalog, map_id, run_after=db_now_plus(-0.5))
     jobs = take(catalog)
@@ -143,25 +141,14 @@ def test_finished_jobs_are_not_claimed(catalog: Catalog, map_id: UUID) -> None:
     assert take(catalog) == []
 
 
-def test_below_the_least_priority_nothing_is_claimed(catalog: Catalog, map_id: UUID) -> None:
+def test_a_claim_with_a_minimum_priority_takes_no_job_below_it(
+    catalog: Catalog, map_id: UUID
+) -> None:
     bulk = queue(catalog, map_id, 2)
     assert take(catalog, least_priority=Priority.QUERY) == []
     query = queue(catalog, map_id, kind=JobKind.DESCRIBE)
     assert ids(take(catalog, least_priority=Priority.QUERY)) == query
     assert ids(take(catalog)) == bulk
-
-
-def test_every_claim_has_a_fresh_token(catalog: Catalog, map_id: UUID) -> None:
-    queue(catalog, map_id, 2)
-    tokens = set()
-    for _ in range(4):
-        jobs = take(catalog)
-        assert len(jobs) == 2
-        tokens.add(token_of(jobs))
-        with catalog.write() as session:
-            for job in lock_leased_jobs(session, token_of(jobs), jobs):
-                requeue_job(job)
-    assert len(tokens) == 4
 
 
 def test_workers_that_claim_at_once_never_get_the_same_job(catalog: Catalog, map_id: UUID) -> None:
@@ -189,7 +176,7 @@ def test_workers_that_claim_at_once_never_get_the_same_job(catalog: Catalog, map
     assert stored == set(taken)
 
 
-def test_a_claim_passes_over_what_another_one_is_just_taking(postgres: PostgresServer) -> None:
+def test_a_claim_skips_jobs_that_another_claim_has_locked(postgres: PostgresServer) -> None:
     """PostgreSQL alone: SQLite's one writer makes the second worker wait its turn."""
     catalog = Catalog(postgres.new_database())
     migrate(catalog)
@@ -223,7 +210,7 @@ def test_jobs_of_a_map_are_listed_newest_first_and_filtered(catalog: Catalog, ma
 
 
 @pytest.mark.parametrize("waiting", [40, 80, 400])
-def test_workers_share_a_burst_that_one_of_them_sees_first(waiting: int) -> None:
+def test_a_burst_of_jobs_is_shared_between_the_workers(waiting: int) -> None:
     """The first prefetches a batch, as extractors do, before the other comes."""
     shares = [0, 0]
     for worker in itertools.chain([0, 0], itertools.cycle([1, 0])):
@@ -235,6 +222,6 @@ def test_workers_share_a_burst_that_one_of_them_sees_first(waiting: int) -> None
     assert min(shares) > 0.3 * sum(shares)
 
 
-def test_a_single_worker_and_a_long_queue_have_full_batches() -> None:
+def test_a_single_worker_or_a_long_queue_has_full_batches() -> None:
     assert fair_batch_size(5, 1, 32) == 32
     assert fair_batch_size(1000, 2, 32) == 32

@@ -74,7 +74,9 @@ def test_extending_a_lease_locks_its_jobs_in_the_order_of_finishing_them(
     catalog.close()
 
 
-def test_a_worker_that_was_taken_over_can_not_finish(catalog: Catalog, map_id: UUID) -> None:
+def test_a_worker_whose_lease_was_taken_over_finishes_no_job(
+    catalog: Catalog, map_id: UUID
+) -> None:
     waiting = queue(catalog, map_id, alone=True)
     slow = take(catalog, worker="slow")
     expire_lease(catalog, *waiting)
@@ -89,7 +91,9 @@ def test_a_worker_that_was_taken_over_can_not_finish(catalog: Catalog, map_id: U
     assert end(catalog, quick) == []  # once only
 
 
-def test_an_expired_lease_that_no_one_took_over_still_holds(catalog: Catalog, map_id: UUID) -> None:
+def test_a_worker_finishes_jobs_of_an_expired_lease_that_no_one_took_over(
+    catalog: Catalog, map_id: UUID
+) -> None:
     waiting = queue(catalog, map_id)
     jobs = take(catalog)
     expire_lease(catalog, *waiting)
@@ -141,7 +145,7 @@ def _wait_for_another_lease(
         time.sleep(0.01)
 
 
-def test_holding_a_lost_lease_does_not_bring_it_back(catalog: Catalog, map_id: UUID) -> None:
+def test_a_lease_that_was_taken_over_is_not_extended(catalog: Catalog, map_id: UUID) -> None:
     queue(catalog, map_id)
     (job,) = take(catalog)
     expire_lease(catalog, job.id)
@@ -250,7 +254,7 @@ def test_a_model_change_that_crashed_too_often_abandons_its_generation(
 
 
 @pytest.mark.parametrize("years", [-30, 30])
-def test_leases_know_no_clock_but_the_databases(
+def test_leases_use_the_clock_of_the_database(
     catalog: Catalog, map_id: UUID, monkeypatch: pytest.MonkeyPatch, years: int
 ) -> None:
     waiting = queue(catalog, map_id, 2)
@@ -296,7 +300,9 @@ def _shift_this_workers_clock(monkeypatch: pytest.MonkeyPatch, seconds: float) -
             monkeypatch.setattr(module, "datetime", WrongDatetime)
 
 
-def test_a_job_is_blamed_for_a_crash_once_it_has_begun(catalog: Catalog, map_id: UUID) -> None:
+def test_a_crash_counts_an_attempt_of_a_job_only_after_its_start(
+    catalog: Catalog, map_id: UUID
+) -> None:
     with catalog.write() as session:
         job_id = add_job(session, map_id).id
     for _ in range(5):

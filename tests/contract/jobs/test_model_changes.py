@@ -60,7 +60,7 @@ def test_a_second_model_change_is_refused_and_names_the_first(
         start_model_change(session, map_id, JobKind.IMPORT, {})
 
 
-def test_of_model_changes_that_start_at_once_one_wins(catalog: Catalog, map_id: UUID) -> None:
+def test_one_of_two_concurrent_model_changes_is_accepted(catalog: Catalog, map_id: UUID) -> None:
     together = threading.Barrier(4)
 
     def start() -> UUID | str:
@@ -77,7 +77,7 @@ def test_of_model_changes_that_start_at_once_one_wins(catalog: Catalog, map_id: 
     assert outcomes.count(str(winner)) == 3
 
 
-def test_the_first_generation_of_a_map_answers_at_once_releases_who_waited_and_outlasts_its_job(
+def test_the_first_generation_of_a_map_is_active_at_once_and_outlives_its_cancelled_job(
     catalog: Catalog, map_id: UUID
 ) -> None:
     waiting = queue(catalog, map_id, 2, waiting_for=WaitingFor.VOCABULARY)

@@ -129,7 +129,7 @@ def test_a_job_that_was_taken_over_meanwhile_is_left_to_its_new_worker(
     assert (job.state, job.worker, job.error) == (JobState.RUNNING, "another", None)
 
 
-def test_the_loop_outlasts_an_outage_of_the_catalog(
+def test_the_job_loop_continues_after_an_outage_of_the_catalog(
     recorder: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shared.jobs.runner.UNAVAILABLE_RETRY_SECONDS", 0.0)

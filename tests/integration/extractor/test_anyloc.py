@@ -10,7 +10,7 @@ import pytest
 from shared.catalog.jobs import WaitingFor
 from shared.config.settings import Settings
 from shared.jobs import JobState
-from tests.integration.workplace import Workplace
+from tests.integration.harness import Harness
 from tests.support.photos import photo_bytes
 from tests.support.vit import random_weights, save
 
@@ -26,24 +26,24 @@ def settings(weights: Path) -> Settings:
 
 
 def test_a_fit_makes_the_photos_of_a_dinov2_map_searchable(
-    workplace_of: Callable[[str], Workplace], weights: Path
+    harness_of: Callable[[str], Harness], weights: Path
 ) -> None:
     from shared.descriptors.backbones.dinov2 import SHAPES
 
     save(random_weights(SHAPES["vits14"], blocks=1), weights)
-    workplace = workplace_of(EXTRACTOR)
-    (photo, _) = workplace.upload(1, 2)
-    workplace.drain()
-    job = workplace.job_of(photo)
+    harness = harness_of(EXTRACTOR)
+    (photo, _) = harness.upload(1, 2)
+    harness.drain()
+    job = harness.job_of(photo)
     assert (job.state, job.waiting_for) == (JobState.QUEUED, WaitingFor.VOCABULARY)
-    fit = workplace.fit(clusters=None)
+    fit = harness.fit(clusters=None)
     assert fit.state == JobState.SUCCEEDED, fit.error
-    generation = workplace.active()
+    generation = harness.active()
     assert generation.extractor == EXTRACTOR
     assert generation.dimension == 2 * 384
     spec = generation.spec
     assert (spec["backbone"], spec["layer"], spec["facet"]) == ("dinov2-vits14", "0", "value")
-    assert workplace.searchable() == 2
-    query = workplace.ask(photo_bytes(1))
-    workplace.drain()
-    assert workplace.job(query).state == JobState.SUCCEEDED
+    assert harness.searchable() == 2
+    query = harness.ask(photo_bytes(1))
+    harness.drain()
+    assert harness.job(query).state == JobState.SUCCEEDED

@@ -74,7 +74,7 @@ def test_a_process_that_dies_is_an_error_that_says_how() -> None:
         run_in_child(kill_itself, on_progress=nothing, check=nothing)
 
 
-def test_cancelled_work_ends_at_once() -> None:
+def test_cancelling_ends_the_child_process_at_once() -> None:
     pids: list[int] = []
 
     def check() -> None:
@@ -96,7 +96,7 @@ if __name__ == "__main__":
 """
 
 
-def test_a_child_dies_with_its_killed_parent(tmp_path: Path) -> None:
+def test_a_child_process_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
     script = tmp_path / "parent.py"
     script.write_text(PARENT)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}

@@ -31,12 +31,12 @@ from shared.jobs import JobKind, JobState
 from shared.storage.chunks import decode_rows, manifest_key
 from shared.storage.keys import query_vector_key, thumbnail_key
 from tests.integration.extractor.conftest import Hook
-from tests.integration.workplace import Workplace, expected_row, once, same
+from tests.integration.harness import Harness, expected_row, once, same
 from tests.support.catalog_rows import failure_code, problem_of, set_columns
 from tests.support.photos import encoded, photo_bytes, photo_image
 
 
-def test_each_photo_gets_its_one_row_and_the_right_one(averages: Workplace) -> None:
+def test_each_photo_has_one_descriptor_row_that_is_its_own(averages: Harness) -> None:
     photo_ids = averages.upload(*range(9))  # three batches
     averages.drain()
     assert averages.ended() == (9, 0)
@@ -64,7 +64,7 @@ def test_each_photo_gets_its_one_row_and_the_right_one(averages: Workplace) -> N
 
 
 def test_a_query_in_an_empty_map_leaves_its_row_beside_its_bytes_and_none_in_the_map(
-    averages: Workplace,
+    averages: Harness,
 ) -> None:
     data = photo_bytes(2)
     job_id = averages.ask(data)
@@ -82,7 +82,7 @@ def test_a_query_in_an_empty_map_leaves_its_row_beside_its_bytes_and_none_in_the
     assert averages.rows() == {}
 
 
-def test_a_photo_that_is_at_fault_fails_alone(averages: Workplace) -> None:
+def test_an_undecodable_photo_fails_without_the_others_of_its_batch(averages: Harness) -> None:
     good = averages.upload(1, 2)
     _, undecodable = averages.upload_bytes(b"\xff\xd8\xff\xe0 this is no JPEG")
     lost_photo, lost = averages.upload_bytes(photo_bytes(4))
@@ -105,7 +105,7 @@ def test_a_photo_that_is_at_fault_fails_alone(averages: Workplace) -> None:
 
 @pytest.mark.databases("sqlite", "postgresql")
 def test_two_workers_at_once_describe_each_photo_once(
-    averages: Workplace, make_worker: Callable[[], ExtractorWorker]
+    averages: Harness, make_worker: Callable[[], ExtractorWorker]
 ) -> None:
     photo_ids = averages.upload(*range(16))
     workers = [make_worker(), make_worker()]
@@ -121,8 +121,8 @@ def test_two_workers_at_once_describe_each_photo_once(
 
 
 @pytest.mark.databases("sqlite", "postgresql")
-def test_of_two_workers_that_begin_a_maps_first_generation_one_wins(
-    averages: Workplace,
+def test_two_workers_create_one_first_generation_of_a_map(
+    averages: Harness,
     make_worker: Callable[[], ExtractorWorker],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -150,10 +150,10 @@ def _drain(worker: ExtractorWorker) -> None:
 
 
 def test_photos_of_different_sizes_are_described_in_one_batch(
-    workplace_of: Callable[[str], Workplace],
+    harness_of: Callable[[str], Harness],
 ) -> None:
     extractor = "test-tiny-vlad:aggregator=gem,preprocessing=demo1024"
-    place = workplace_of(extractor)
+    place = harness_of(extractor)
     sizes = [(64, 48), (48, 64), (1500, 900), (64, 48), (10, 10)]
     photos = [encoded(photo_image(n, *size), "PNG") for n, size in enumerate(sizes)]
     photo_ids = [place.upload_bytes(photo)[0] for photo in photos]
@@ -170,9 +170,9 @@ def test_photos_of_different_sizes_are_described_in_one_batch(
 
 
 def test_vocabulary_is_fitted_on_photos_of_different_sizes(
-    workplace_of: Callable[[str], Workplace],
+    harness_of: Callable[[str], Harness],
 ) -> None:
-    place = workplace_of("test-tiny-vlad:aggregator=soft-vlad,clusters=2,preprocessing=round14")
+    place = harness_of("test-tiny-vlad:aggregator=soft-vlad,clusters=2,preprocessing=round14")
     for number, size in enumerate([(64, 48), (48, 64), (90, 90)]):
         place.upload_bytes(encoded(photo_image(number, *size), "PNG"))
     place.fit(clusters=2)
@@ -182,7 +182,7 @@ def test_vocabulary_is_fitted_on_photos_of_different_sizes(
 
 
 def test_a_query_does_not_wait_for_the_batch_that_is_being_described(
-    averages: Workplace, before_describing: Hook
+    averages: Harness, before_describing: Hook
 ) -> None:
     averages.upload(0)
     averages.drain()
@@ -200,8 +200,8 @@ def test_a_query_does_not_wait_for_the_batch_that_is_being_described(
     assert len(averages.rows()) == 5
 
 
-def test_nothing_is_described_beside_a_photo_that_is_tried_alone(
-    averages: Workplace, before_describing: Hook
+def test_no_query_is_described_beside_a_job_marked_alone(
+    averages: Harness, before_describing: Hook
 ) -> None:
     photo_id, job_id = averages.upload_bytes(photo_bytes(0))
     set_columns(averages.catalog, job_id, alone=True)
@@ -222,7 +222,7 @@ def test_nothing_is_described_beside_a_photo_that_is_tried_alone(
 
 
 def test_queries_and_photos_are_described_while_a_vocabulary_is_fitted(
-    vlads: Workplace, monkeypatch: pytest.MonkeyPatch
+    vlads: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vlads.upload(*range(8))
     vlads.fit()
@@ -244,7 +244,7 @@ def test_queries_and_photos_are_described_while_a_vocabulary_is_fitted(
 
 @pytest.mark.usefixtures("fit_at_four_photos")
 def test_photos_wait_for_a_vocabulary_which_is_fitted_once_there_are_enough(
-    vlads: Workplace,
+    vlads: Harness,
 ) -> None:
     photo_ids = vlads.upload(1, 2, 3)
     query = vlads.ask(photo_bytes(9))
@@ -282,7 +282,7 @@ def test_photos_wait_for_a_vocabulary_which_is_fitted_once_there_are_enough(
 
 @pytest.mark.usefixtures("fit_at_four_photos")
 def test_a_vocabulary_is_fitted_again_when_the_map_has_doubled_also_after_a_cancelled_fit(
-    vlads: Workplace,
+    vlads: Harness,
 ) -> None:
     vlads.upload(*range(4))
     vlads.drain()
@@ -308,7 +308,7 @@ def test_a_vocabulary_is_fitted_again_when_the_map_has_doubled_also_after_a_canc
 
 @pytest.mark.usefixtures("fit_at_four_photos")
 def test_a_fit_waits_for_the_end_of_an_upload_unless_the_map_is_overdue(
-    vlads: Workplace, monkeypatch: pytest.MonkeyPatch
+    vlads: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vlads.upload(*range(4))
     assert vlads.fit_if_due() == [], "photos are queued"
@@ -326,7 +326,7 @@ def test_a_fit_waits_for_the_end_of_an_upload_unless_the_map_is_overdue(
 
 @pytest.mark.usefixtures("fit_at_four_photos")
 def test_no_vocabulary_is_fitted_where_it_is_switched_off_or_none_is_used(
-    vlads: Workplace, averages: Workplace
+    vlads: Harness, averages: Harness
 ) -> None:
     for place in (vlads, averages):
         place.upload(*range(4))
@@ -340,7 +340,7 @@ def test_no_vocabulary_is_fitted_where_it_is_switched_off_or_none_is_used(
 
 
 def test_a_photo_that_finds_no_vocabulary_while_one_is_made_is_not_left_waiting(
-    vlads: Workplace,
+    vlads: Harness,
     make_worker: Callable[[], ExtractorWorker],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -363,8 +363,8 @@ def test_a_photo_that_finds_no_vocabulary_while_one_is_made_is_not_left_waiting(
     assert set(vlads.rows()) >= set(late)
 
 
-def _fit_with(workplace: Workplace, worker: ExtractorWorker) -> None:
-    workplace.start(JobKind.FIT, clusters=8, sample=100, seed=0)
+def _fit_with(harness: Harness, worker: ExtractorWorker) -> None:
+    harness.start(JobKind.FIT, clusters=8, sample=100, seed=0)
     assert worker.fits.run_next(threading.Event())
     _drain(worker)
-    assert workplace.active().state == GenerationState.ACTIVE
+    assert harness.active().state == GenerationState.ACTIVE

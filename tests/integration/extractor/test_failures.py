@@ -31,7 +31,7 @@ from shared.jobs.transitions import requeue_job_as_new
 from shared.storage import FolderStore
 from tests.integration.extractor.conftest import Hook
 from tests.integration.extractor.test_describe_photos import _drain
-from tests.integration.workplace import Workplace, expected_row, once, pixels_of, same
+from tests.integration.harness import Harness, expected_row, once, pixels_of, same
 from tests.support.catalog_rows import end_pauses, expire_lease, problem_of, states
 from tests.support.photos import photo_bytes
 
@@ -39,7 +39,7 @@ DAY_SECONDS = 86_400.0
 
 
 def test_a_photo_that_crashes_the_forward_pass_fails_and_harms_no_other(
-    averages: Workplace, before_describing: Hook
+    averages: Harness, before_describing: Hook
 ) -> None:
     poison = pixels_of(photo_bytes(2))
     batches: list[int] = []
@@ -65,7 +65,7 @@ def test_a_photo_that_crashes_the_forward_pass_fails_and_harms_no_other(
 
 
 def test_a_descriptor_that_is_not_finite_is_refused_and_harms_no_other(
-    averages: Workplace, monkeypatch: pytest.MonkeyPatch
+    averages: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     poison = pixels_of(photo_bytes(2))
     real = TinyBackbone.features
@@ -91,7 +91,7 @@ def test_a_descriptor_that_is_not_finite_is_refused_and_harms_no_other(
 
 
 def test_a_crash_between_chunk_and_commit_leaves_an_orphan_that_is_collected(
-    averages: Workplace,
+    averages: Harness,
     make_worker: Callable[[], ExtractorWorker],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -129,16 +129,23 @@ def _age(store: FolderStore, key: str, seconds: float) -> None:
 
 
 def test_leases_end_when_the_catalog_becomes_unreachable_during_a_drain(
-    averages: Workplace, monkeypatch: pytest.MonkeyPatch
+    averages: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    photo_ids = averages.upload(*range(8))
-    calls = iter(range(10))
+    photo_ids = averages.upload(*range(12))
+    claims, away, write = iter(range(10)), threading.Event(), averages.catalog.write
+
+    def write_or_fail(**options: Any) -> Any:
+        if away.is_set():
+            raise OperationalError("the catalog is away", None, Exception())
+        return write(**options)
 
     def claim_or_fail(*arguments: Any, **options: Any) -> list[Job]:
-        if next(calls) == 2:  # a batch is done, the next one is taken and being decoded
-            raise OperationalError("the catalog is away", None, Exception())
+        if next(claims) == 2:  # two batches are in the next stages
+            away.set()
+            write_or_fail()
         return claim_jobs(*arguments, **options)
 
+    monkeypatch.setattr(averages.catalog, "write", write_or_fail)
     monkeypatch.setattr("shared.jobs.runner.claim_jobs", claim_or_fail)
     with pytest.raises(OperationalError):
         averages.drain()
@@ -146,15 +153,15 @@ def test_leases_end_when_the_catalog_becomes_unreachable_during_a_drain(
     leases = [t.name for t in threading.enumerate() if t.name.startswith("lease-")]
     assert leases == []
     monkeypatch.undo()
-    assert len(averages.rows()) == 4
-    expire_lease(averages.catalog, *(averages.job_of(p).id for p in photo_ids[4:]))
+    unfinished = [job for job in map(averages.job_of, photo_ids) if job.lease_token is not None]
+    expire_lease(averages.catalog, *(job.id for job in unfinished))
     reclaim_leases(averages.catalog, averages.wakeups)
     averages.drain()
     assert set(averages.rows()) == set(photo_ids)
 
 
 def test_nothing_of_a_batch_is_committed_once_its_lease_was_taken_over(
-    averages: Workplace,
+    averages: Harness,
     make_worker: Callable[[], ExtractorWorker],
     before_describing: Hook,
 ) -> None:
@@ -180,8 +187,8 @@ def test_nothing_of_a_batch_is_committed_once_its_lease_was_taken_over(
     assert {averages.job_of(photo_id).worker for photo_id in photo_ids} == {"worker-1"}
 
 
-def test_one_job_that_was_taken_over_is_a_dead_row_beside_the_others(
-    averages: Workplace, before_describing: Hook
+def test_a_job_that_was_taken_over_leaves_a_dead_row_in_the_chunk(
+    averages: Harness, before_describing: Hook
 ) -> None:
     photo_ids = averages.upload(1, 2, 3)
     lost = averages.job_of(photo_ids[1]).id
@@ -206,7 +213,7 @@ def test_one_job_that_was_taken_over_is_a_dead_row_beside_the_others(
 
 
 def test_a_photo_deleted_while_it_is_described_is_not_in_the_generation(
-    averages: Workplace, before_describing: Hook
+    averages: Harness, before_describing: Hook
 ) -> None:
     photo_ids = averages.upload(1, 2, 3)
     goes = averages.job_of(photo_ids[1]).id
@@ -223,7 +230,7 @@ def test_a_photo_deleted_while_it_is_described_is_not_in_the_generation(
     assert states(averages.catalog, [goes, left]) == [JobState.CANCELLED, JobState.CANCELLED]
 
 
-def test_a_photo_deleted_before_it_is_read_costs_nothing(averages: Workplace) -> None:
+def test_a_photo_deleted_before_it_is_read_is_not_described(averages: Harness) -> None:
     photo_ids = averages.upload(1, 2)
     job_id = averages.job_of(photo_ids[0]).id
     averages.delete(photo_ids[0])
@@ -236,7 +243,7 @@ def test_a_photo_deleted_before_it_is_read_costs_nothing(averages: Workplace) ->
 
 @pytest.mark.parametrize("failing", ["open", "writer"])
 def test_jobs_pause_while_the_object_store_is_unreachable_and_no_attempt_is_counted(
-    averages: Workplace, monkeypatch: pytest.MonkeyPatch, failing: str
+    averages: Harness, monkeypatch: pytest.MonkeyPatch, failing: str
 ) -> None:
     photo_ids = averages.upload(1, 2)
     query = averages.ask(photo_bytes(3))
@@ -262,7 +269,7 @@ def test_jobs_pause_while_the_object_store_is_unreachable_and_no_attempt_is_coun
 
 
 def test_photos_wait_for_a_worker_that_reproduces_the_generation(
-    averages: Workplace, monkeypatch: pytest.MonkeyPatch
+    averages: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     averages.upload(1)
     averages.drain()

@@ -28,7 +28,7 @@ from shared.jobs import Job, JobKind, JobState
 from shared.storage.chunks import Rows, decode_rows, read_row
 from shared.storage.keys import WHITENINGS, query_vector_key
 from tests.integration.conftest import LentDecoders
-from tests.integration.workplace import Workplace, expected_row, same
+from tests.integration.harness import Harness, expected_row, same
 from tests.support.catalog_rows import failure_code
 from tests.support.checkpoints import none_added
 from tests.support.photos import photo_bytes
@@ -41,7 +41,7 @@ CPU = torch.device("cpu")
 
 
 @pytest.fixture
-def described(averages: Workplace) -> Workplace:
+def described(averages: Harness) -> Harness:
     """A map of PHOTOS photos with 16 dimensions."""
     averages.upload(*range(PHOTOS))
     averages.drain()
@@ -49,14 +49,14 @@ def described(averages: Workplace) -> Workplace:
 
 
 @pytest.fixture
-def reduced(described: Workplace) -> Workplace:
+def reduced(described: Harness) -> Harness:
     """The same after PCA to KEPT dimensions."""
     reduce(described)
     return described
 
 
-def reduce(workplace: Workplace, pca: int = KEPT) -> Job:
-    job = workplace.finish(workplace.start(JobKind.PCA, pca=pca))
+def reduce(harness: Harness, pca: int = KEPT) -> Job:
+    job = harness.finish(harness.start(JobKind.PCA, pca=pca))
     assert job.state == JobState.SUCCEEDED, job.error
     return job
 
@@ -71,8 +71,8 @@ def projected(whitening: PcaWhitening, row: Rows) -> Rows:
     return found
 
 
-def whitenings(workplace: Workplace) -> list[StoredWhitening]:
-    with workplace.catalog.read() as session:
+def whitenings(harness: Harness) -> list[StoredWhitening]:
+    with harness.catalog.read() as session:
         return list(session.query(StoredWhitening))
 
 
@@ -91,24 +91,24 @@ def forbid_decoding(monkeypatch: pytest.MonkeyPatch) -> None:
     ["test-tiny-avg", "test-tiny-vlad", "test-tiny-vlad:aggregator=soft-vlad"],
 )
 def test_stored_rows_are_whitened_without_a_photo(
-    workplace_of: Callable[[str], Workplace], extractor: str, monkeypatch: pytest.MonkeyPatch
+    harness_of: Callable[[str], Harness], extractor: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    workplace = workplace_of(extractor)
-    workplace.upload(*range(PHOTOS))
-    workplace.drain()
+    harness = harness_of(extractor)
+    harness.upload(*range(PHOTOS))
+    harness.drain()
     if "vlad" in extractor:
-        workplace.fit(clusters=3)
-    old, before = workplace.active(), workplace.rows()
+        harness.fit(clusters=3)
+    old, before = harness.active(), harness.rows()
     expected = by_hand(before)
     answering: list[tuple[UUID, int]] = []
     forbid_decoding(monkeypatch)
 
-    job = workplace.finish(
-        workplace.start(JobKind.PCA, pca=KEPT),
-        lambda: answering.append((workplace.active().id, workplace.searchable())),
+    job = harness.finish(
+        harness.start(JobKind.PCA, pca=KEPT),
+        lambda: answering.append((harness.active().id, harness.searchable())),
     )
 
-    new = workplace.active()
+    new = harness.active()
     assert {count for _, count in answering} == {PHOTOS}  # at no moment fewer
     assert [one for one, _ in itertools.groupby(a for a, _ in answering)] == [old.id, new.id]
     assert new.spec == {
@@ -121,7 +121,7 @@ def test_stored_rows_are_whitened_without_a_photo(
         old.dimension,
         old.vocabulary_id,
     )
-    rows = workplace.rows()
+    rows = harness.rows()
     assert rows.keys() == before.keys()
     for photo_id, row in rows.items():
         assert same(row, projected(expected, before[photo_id]))
@@ -134,14 +134,14 @@ def test_stored_rows_are_whitened_without_a_photo(
         "explained": pytest.approx(expected.explained),
     }
     assert job.progress_done == job.progress_total == 2 * PHOTOS + fits.FIT_PROGRESS_UNITS
-    (stored,) = whitenings(workplace)
-    file = decode_whitening(workplace.store.get(stored.object_key))
+    (stored,) = whitenings(harness)
+    file = decode_whitening(harness.store.get(stored.object_key))
     assert file.whitening.sha256 == stored.sha256 == expected.sha256
     assert file.spec == old.spec
 
 
 def test_labelled_queries_are_projected_and_not_fitted_on(
-    described: Workplace,
+    described: Harness,
 ) -> None:
     searched = sorted(described.rows())[:4]
     with described.catalog.write() as session:
@@ -160,7 +160,7 @@ def test_labelled_queries_are_projected_and_not_fitted_on(
         assert same(rows[photo_id], projected(expected, before[photo_id]))
 
 
-def test_queries_and_new_photos_are_projected(reduced: Workplace) -> None:
+def test_queries_and_new_photos_are_projected(reduced: Harness) -> None:
     stored = whitenings(reduced)[0]
     whitening = decode_whitening(reduced.store.get(stored.object_key)).whitening
     data = photo_bytes(50)
@@ -172,8 +172,8 @@ def test_queries_and_new_photos_are_projected(reduced: Workplace) -> None:
 
 
 @pytest.mark.parametrize("missing", [False, True])
-def test_a_photo_whose_row_is_damaged_is_described_anew(
-    described: Workplace, monkeypatch: pytest.MonkeyPatch, missing: bool
+def test_a_photo_with_a_damaged_row_is_described_from_its_original(
+    described: Harness, monkeypatch: pytest.MonkeyPatch, missing: bool
 ) -> None:
     before = described.rows()
     expected, damaged = by_hand(before), before[sorted(before)[3]]
@@ -195,7 +195,7 @@ def test_a_photo_whose_row_is_damaged_is_described_anew(
 
 
 def test_a_photo_whose_projected_row_is_not_finite_fails_alone(
-    described: Workplace, monkeypatch: pytest.MonkeyPatch
+    described: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = described.rows()
     refused = sorted(before)[3]
@@ -216,7 +216,7 @@ def test_a_photo_whose_projected_row_is_not_finite_fails_alone(
 
 
 def test_photos_are_described_where_the_rows_that_answer_were_made_otherwise(
-    reduced: Workplace, monkeypatch: pytest.MonkeyPatch
+    reduced: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An upgrade: the rows are projected ones, by a former decoder. The whitening stays."""
     before, old = reduced.rows(), reduced.active()
@@ -237,7 +237,7 @@ def test_photos_are_described_where_the_rows_that_answer_were_made_otherwise(
 # --- going on from there ---------------------------------------------------------------------
 
 
-def test_the_way_back_leads_to_whole_descriptors(described: Workplace) -> None:
+def test_switching_off_pca_describes_full_dimension_again(described: Harness) -> None:
     before, old = described.rows(), described.active()
     reduce(described)
     job = described.finish(described.start(JobKind.SWITCH, vocabulary_id=None))
@@ -249,7 +249,7 @@ def test_the_way_back_leads_to_whole_descriptors(described: Workplace) -> None:
     assert all(same(row, before[photo_id]) for photo_id, row in described.rows().items())
 
 
-def test_a_new_vocabulary_comes_without_pca(vlads: Workplace) -> None:
+def test_a_new_vocabulary_comes_without_pca(vlads: Harness) -> None:
     vlads.upload(*range(PHOTOS))
     vlads.fit(clusters=3)
     reduce(vlads)
@@ -264,13 +264,13 @@ def test_a_new_vocabulary_comes_without_pca(vlads: Workplace) -> None:
     assert same(rows[first], expected_row("test-tiny-vlad", photo_bytes(0), centres))
 
 
-def test_a_pca_of_a_pca_is_refused(reduced: Workplace) -> None:
+def test_a_pca_of_a_pca_is_refused(reduced: Harness) -> None:
     before = reduced.active().id
     assert failure_code(reduced.finish(reduced.start(JobKind.PCA, pca=3))) == "already_reduced"
     assert reduced.active().id == before
 
 
-def test_what_can_not_be_fitted_fails_with_the_reason(described: Workplace) -> None:
+def test_a_pca_fit_on_too_few_photos_or_to_too_many_dimensions_fails(described: Harness) -> None:
     before = described.active().id
     for pca, code in ((PHOTOS, "pca_too_few_rows"), (17, "pca_too_many_dimensions")):
         assert failure_code(described.finish(described.start(JobKind.PCA, pca=pca))) == code
@@ -278,7 +278,7 @@ def test_what_can_not_be_fitted_fails_with_the_reason(described: Workplace) -> N
 
 
 def test_photos_that_are_all_alike_are_refused_when_their_rows_are_known(
-    averages: Workplace,
+    averages: Harness,
 ) -> None:
     for number in range(PHOTOS):  # other bytes, the same pixels
         averages.upload_bytes(photo_bytes(1) + bytes([number]))
@@ -288,17 +288,17 @@ def test_photos_that_are_all_alike_are_refused_when_their_rows_are_known(
 
 
 def test_a_whitening_is_not_fitted_on_rows_of_another_release(
-    described: Workplace, monkeypatch: pytest.MonkeyPatch
+    described: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(extractor_module, "DECODER", "another release")
     assert failure_code(described.finish(described.start(JobKind.PCA, pca=3))) == "spec_differs"
 
 
-def test_a_map_without_descriptors_is_refused(averages: Workplace) -> None:
+def test_a_map_without_descriptors_is_refused(averages: Harness) -> None:
     assert failure_code(averages.finish(averages.start(JobKind.PCA, pca=3))) == "nothing_described"
 
 
-def test_a_cancelled_pca_changes_nothing(described: Workplace) -> None:
+def test_a_cancelled_pca_changes_nothing(described: Harness) -> None:
     before = described.active().id
     job_id = described.start(JobKind.PCA, pca=KEPT)
     described.drain()
@@ -313,7 +313,7 @@ def test_a_cancelled_pca_changes_nothing(described: Workplace) -> None:
 # --- what is left of it ----------------------------------------------------------------------
 
 
-def test_a_whitening_goes_when_its_generations_have_ended(reduced: Workplace) -> None:
+def test_a_whitening_is_deleted_after_its_last_generation(reduced: Harness) -> None:
     (stored,) = whitenings(reduced)
     collect_whitenings(reduced.catalog, reduced.store, grace_seconds=0)
     collect_orphans(reduced.catalog, reduced.store, age_seconds=-1)

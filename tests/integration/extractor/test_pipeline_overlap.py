@@ -16,7 +16,7 @@ from shared.descriptors.extractor import Extractor
 from shared.jobs import JobState
 from shared.storage import FolderStore
 from tests.integration.extractor.small_gpu import make_too_heavy
-from tests.integration.workplace import Workplace, expected_row, same
+from tests.integration.harness import Harness, expected_row, same
 from tests.support.catalog_rows import problem_of, set_columns
 from tests.support.photos import photo_bytes
 
@@ -68,7 +68,7 @@ def in_thread(do: Callable[[], Any]) -> tuple[threading.Thread, list[Any]]:
 
 
 def test_next_batch_is_described_while_one_is_published_and_the_one_after_waits(
-    averages: Workplace, gate: Gate
+    averages: Harness, gate: Gate
 ) -> None:
     photo_ids = averages.upload(*range(3 * BATCH))
     draining, results = in_thread(averages.drain)
@@ -87,7 +87,7 @@ def test_next_batch_is_described_while_one_is_published_and_the_one_after_waits(
 
 
 def test_leases_of_batches_that_wait_to_be_published_are_extended(
-    averages: Workplace, gate: Gate, make_worker: Callable[..., ExtractorWorker]
+    averages: Harness, gate: Gate, make_worker: Callable[..., ExtractorWorker]
 ) -> None:
     photo_ids = averages.upload(*range(2 * BATCH))
     lease = timedelta(seconds=1.5)
@@ -111,7 +111,7 @@ def test_leases_of_batches_that_wait_to_be_published_are_extended(
 
 
 def test_query_is_published_at_once_while_bulk_batches_wait_to_be(
-    averages: Workplace, gate: Gate
+    averages: Harness, gate: Gate
 ) -> None:
     averages.upload(0)
     averages.drain()
@@ -126,9 +126,7 @@ def test_query_is_published_at_once_while_bulk_batches_wait_to_be(
     assert len(averages.rows()) == 2 * BATCH + 1
 
 
-def test_photo_that_is_tried_alone_begins_when_nothing_else_is_under_way(
-    averages: Workplace, gate: Gate
-) -> None:
+def test_job_marked_alone_starts_after_all_others_have_ended(averages: Harness, gate: Gate) -> None:
     averages.upload(*range(BATCH))
     (suspect,) = averages.upload(50)
     job_id = averages.job_of(suspect).id
@@ -144,7 +142,7 @@ def test_photo_that_is_tried_alone_begins_when_nothing_else_is_under_way(
 
 
 def test_stopping_worker_publishes_what_it_has_described_and_gives_back_the_rest(
-    averages: Workplace, gate: Gate
+    averages: Harness, gate: Gate
 ) -> None:
     photo_ids = averages.upload(*range(3 * BATCH))
     stop = threading.Event()
@@ -161,8 +159,8 @@ def test_stopping_worker_publishes_what_it_has_described_and_gives_back_the_rest
     assert all(job.attempts == 0 and not job.alone for job in left)
 
 
-def test_batch_whose_publishing_crashes_is_tried_alone_and_the_next_one_is_not_to_blame(
-    averages: Workplace, monkeypatch: pytest.MonkeyPatch
+def test_jobs_of_a_batch_whose_publishing_crashed_are_retried_alone_and_the_next_batch_is_not(
+    averages: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls = iter(range(100))
 
@@ -181,7 +179,7 @@ def test_batch_whose_publishing_crashes_is_tried_alone_and_the_next_one_is_not_t
 
 
 def test_an_object_store_outage_during_publishing_costs_no_attempt(
-    averages: Workplace, monkeypatch: pytest.MonkeyPatch
+    averages: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real, calls = FolderStore.writer, iter(range(100))
     photo_ids = averages.upload(*range(2 * BATCH))
@@ -200,7 +198,7 @@ def test_an_object_store_outage_during_publishing_costs_no_attempt(
 
 
 def test_photo_that_the_gpu_can_not_hold_fails_alone_and_is_not_tried_again(
-    averages: Workplace, monkeypatch: pytest.MonkeyPatch
+    averages: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make_too_heavy(monkeypatch, 7)
     photo_ids = averages.upload(1, 7, 2)

@@ -19,8 +19,8 @@ from shared.catalog.vocabularies import vocabulary_standing
 from shared.config.settings import Settings
 from shared.jobs import Job, JobKind, JobState
 from tests.integration.extractor.model_changes import import_file, npy, some_centres
+from tests.integration.harness import Harness, expected_row, same
 from tests.integration.in_process_api import Service
-from tests.integration.workplace import Workplace, expected_row, same
 from tests.support.catalog_rows import set_columns
 from tests.support.photos import photo_bytes
 from tests.support.vit import random_weights, save
@@ -38,29 +38,29 @@ def settings(weights: Path, monkeypatch: pytest.MonkeyPatch) -> Settings:
 
 
 @pytest.fixture
-def pooled(vlads: Workplace) -> Workplace:
+def pooled(vlads: Harness) -> Harness:
     """A map of four photos, described before it has a vocabulary."""
     vlads.upload(*range(4))
     vlads.drain()
     return vlads
 
 
-def extractors(workplace: Workplace) -> tuple[str, str, str]:
+def extractors(harness: Harness) -> tuple[str, str, str]:
     """Extractor of the map, that of its active generation, and the standing of its vocabulary."""
-    with workplace.catalog.read() as session:
-        generation = workplace.active()
-        map_ = session.get_one(Map, workplace.map_id)
+    with harness.catalog.read() as session:
+        generation = harness.active()
+        map_ = session.get_one(Map, harness.map_id)
         return map_.extractor, generation.extractor, vocabulary_standing(session, generation)
 
 
-def newest_job(workplace: Workplace, kind: JobKind) -> UUID | None:
-    with workplace.catalog.read() as session:
+def newest_job(harness: Harness, kind: JobKind) -> UUID | None:
+    with harness.catalog.read() as session:
         of_kind = select(Job.id).where(Job.kind == kind).order_by(Job.id.desc())
         return session.scalars(of_kind.limit(1)).first()
 
 
 def test_the_first_photo_is_described_by_pooling_the_same_local_features(
-    pooled: Workplace,
+    pooled: Harness,
 ) -> None:
     assert extractors(pooled) == (VLAD, POOLED, "pending")
     assert pooled.searchable() == 4
@@ -73,7 +73,7 @@ def test_the_first_photo_is_described_by_pooling_the_same_local_features(
 
 @pytest.mark.usefixtures("fit_at_four_photos")
 def test_with_enough_photos_a_vocabulary_is_fitted_while_the_pooled_descriptors_answer(
-    pooled: Workplace,
+    pooled: Harness,
 ) -> None:
     photo_ids = pooled.upload(4)
     pooled.drain()
@@ -90,14 +90,14 @@ def test_with_enough_photos_a_vocabulary_is_fitted_while_the_pooled_descriptors_
     assert len(pooled.rows()[photo_ids[0]]) == 16 * pooled.active().spec["clusters"]
 
 
-def test_an_imported_vocabulary_ends_the_pooling(pooled: Workplace) -> None:
+def test_an_imported_vocabulary_ends_the_pooling(pooled: Harness) -> None:
     job = import_file(pooled, npy(some_centres(1)))
     assert pooled.finish(job).state == JobState.SUCCEEDED
     assert extractors(pooled) == (VLAD, VLAD, "foreign")
 
 
 def test_describing_the_photos_again_leaves_the_vocabulary_pending(
-    pooled: Workplace,
+    pooled: Harness,
 ) -> None:
     generation = pooled.active()
     spec = {**generation.spec, "decoder": "of another release"}
@@ -115,7 +115,7 @@ def test_describing_the_photos_again_leaves_the_vocabulary_pending(
 
 @pytest.mark.usefixtures("fit_at_four_photos")
 def test_switching_to_the_pooling_extractor_by_name_is_no_waiting_for_a_vocabulary(
-    pooled: Workplace,
+    pooled: Harness,
 ) -> None:
     job = pooled.start(JobKind.SWITCH, vocabulary_id=None, extractor=POOLED)
     assert pooled.finish(job).state == JobState.SUCCEEDED
@@ -124,7 +124,7 @@ def test_switching_to_the_pooling_extractor_by_name_is_no_waiting_for_a_vocabula
 
 
 def test_photos_that_waited_for_a_vocabulary_are_described_once_a_worker_starts(
-    vlads: Workplace, make_worker: Callable[[], ExtractorWorker]
+    vlads: Harness, make_worker: Callable[[], ExtractorWorker]
 ) -> None:
     (photo_id,) = vlads.upload(1)
     set_columns(vlads.catalog, vlads.job_of(photo_id).id, waiting_for=WaitingFor.VOCABULARY)

@@ -16,7 +16,7 @@ from shared.descriptors.inference import Precision
 from shared.extractor_config.configs import get_extractor_config
 from shared.imaging.decode import decode_photo
 from shared.jobs import JobKind, JobState
-from tests.integration.workplace import Workplace, same
+from tests.integration.harness import Harness, same
 from tests.support.catalog_rows import problem_of
 from tests.support.photos import photo_bytes
 
@@ -33,8 +33,8 @@ def precision_of(generation: Generation) -> str:
     return found
 
 
-def test_another_setting_describes_nothing_anew_and_photos_join_in_the_generations_precision(
-    averages: Workplace, make_worker: Callable[..., ExtractorWorker]
+def test_changing_the_precision_setting_keeps_the_precision_of_existing_generations(
+    averages: Harness, make_worker: Callable[..., ExtractorWorker]
 ) -> None:
     assert not same(row("float32", 2), row("bfloat16", 2)), "else this test could not fail"
     first = averages.upload(1)
@@ -51,8 +51,8 @@ def test_another_setting_describes_nothing_anew_and_photos_join_in_the_generatio
     assert same(rows[second[0]], row("float32", 2))
 
 
-def test_setting_decides_for_a_map_that_begins(
-    averages: Workplace, make_worker: Callable[..., ExtractorWorker]
+def test_the_precision_setting_applies_to_new_maps(
+    averages: Harness, make_worker: Callable[..., ExtractorWorker]
 ) -> None:
     averages._worker = make_worker(precision="bfloat16")
     (photo_id,) = averages.upload(2)
@@ -61,8 +61,8 @@ def test_setting_decides_for_a_map_that_begins(
     assert same(averages.rows()[photo_id], row("bfloat16", 2))
 
 
-def test_model_change_brings_the_other_precision_to_all_photos(
-    averages: Workplace, make_worker: Callable[..., ExtractorWorker]
+def test_a_model_change_applies_the_precision_setting(
+    averages: Harness, make_worker: Callable[..., ExtractorWorker]
 ) -> None:
     photo_ids = averages.upload(1, 2, 3)
     averages.drain()
@@ -76,7 +76,7 @@ def test_model_change_brings_the_other_precision_to_all_photos(
 
 
 def test_pca_keeps_the_precision_of_the_rows_that_it_shortens(
-    averages: Workplace, make_worker: Callable[..., ExtractorWorker]
+    averages: Harness, make_worker: Callable[..., ExtractorWorker]
 ) -> None:
     averages.upload(*range(6))
     averages.drain()
@@ -89,7 +89,7 @@ def test_pca_keeps_the_precision_of_the_rows_that_it_shortens(
     assert shortened.keys() - whole.keys() == {"whitening"}
 
 
-def test_photos_wait_where_the_generations_precision_is_not_known(averages: Workplace) -> None:
+def test_photos_wait_for_a_worker_that_knows_the_generations_precision(averages: Harness) -> None:
     averages.upload(1)
     averages.drain()
     _set_precision(averages, averages.active().id, "float8")
@@ -101,7 +101,7 @@ def test_photos_wait_where_the_generations_precision_is_not_known(averages: Work
     assert "float8" in problem_of(job)["detail"]
 
 
-def _set_precision(place: Workplace, generation_id: UUID, precision: str) -> None:
+def _set_precision(place: Harness, generation_id: UUID, precision: str) -> None:
     with place.catalog.write() as session:
         generation = session.get_one(Generation, generation_id)
         generation.spec = {**generation.spec, "precision": precision}

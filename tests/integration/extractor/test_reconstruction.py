@@ -215,7 +215,7 @@ def test_later_run_registers_new_photos_with_what_is_known_of_the_others(
     assert {*walk.ids[3:], *new} == set(walk.component(third).photo_ids)
 
 
-def test_model_is_made_anew_after_one_of_its_photos_was_deleted(
+def test_component_is_reconstructed_again_after_one_of_its_photos_was_deleted(
     walk: Walk, service: Service
 ) -> None:
     walk.reconstruct()

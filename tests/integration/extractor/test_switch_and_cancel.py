@@ -25,14 +25,14 @@ from tests.integration.extractor.model_changes import (
     photo_ids,
     some_centres,
 )
-from tests.integration.workplace import FIT, Workplace, expected_row, same
+from tests.integration.harness import FIT, Harness, expected_row, same
 from tests.support.catalog_rows import failure_code, problem_of
 from tests.support.photos import photo_bytes
 
 
 @pytest.mark.parametrize("stage", ["sample", "cluster"])
 def test_a_fit_can_be_cancelled_in_each_stage(
-    fitted: Workplace, monkeypatch: pytest.MonkeyPatch, stage: str
+    fitted: Harness, monkeypatch: pytest.MonkeyPatch, stage: str
 ) -> None:
     old = fitted.active().id
     job_id = fitted.start(JobKind.FIT, **{**FIT, "seed": 1})
@@ -55,8 +55,8 @@ def test_a_fit_can_be_cancelled_in_each_stage(
     assert fitted.active().id != old
 
 
-def test_a_worker_that_stops_gives_its_fit_back(
-    fitted: Workplace, monkeypatch: pytest.MonkeyPatch
+def test_a_stopping_worker_requeues_its_fit(
+    fitted: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job_id = fitted.start(JobKind.FIT, **{**FIT, "seed": 1})
     stop = threading.Event()
@@ -75,7 +75,7 @@ def test_a_worker_that_stops_gives_its_fit_back(
 
 
 def test_a_fit_can_be_cancelled_while_photos_are_described(
-    fitted: Workplace, monkeypatch: pytest.MonkeyPatch
+    fitted: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     old = fitted.active().id
     for when in ("before", "in between", "in a batch"):
@@ -120,7 +120,7 @@ def _first(real: Callable[..., Any], do: Callable[[], None]) -> Callable[..., An
     return wrapped
 
 
-def test_imported_centres_of_unknown_origin_describe_the_map(vlads: Workplace) -> None:
+def test_imported_centres_of_unknown_origin_describe_the_map(vlads: Harness) -> None:
     ids = vlads.upload(1, 2)
     vlads.drain()  # they wait
     centres = some_centres(5)
@@ -138,7 +138,7 @@ def test_imported_centres_of_unknown_origin_describe_the_map(vlads: Workplace) -
 
 
 @pytest.mark.usefixtures("fit_at_four_photos")
-def test_an_imported_vocabulary_is_not_replaced_automatically(vlads: Workplace) -> None:
+def test_an_imported_vocabulary_is_not_replaced_automatically(vlads: Harness) -> None:
     vlads.upload(*range(4))
     vlads.drain()
     bad = vlads.finish(import_file(vlads, npy(some_centres(4)[:, :8])))
@@ -149,13 +149,13 @@ def test_an_imported_vocabulary_is_not_replaced_automatically(vlads: Workplace) 
     assert vlads.fit_if_due() == []
 
 
-def auto_fit(workplace: Workplace) -> bool:
-    with workplace.catalog.read() as session:
-        return session.get_one(Map, workplace.map_id).auto_fit
+def auto_fit(harness: Harness) -> bool:
+    with harness.catalog.read() as session:
+        return session.get_one(Map, harness.map_id).auto_fit
 
 
 def test_an_unusable_vocabulary_is_refused_with_the_reason_and_changes_nothing(
-    fitted: Workplace,
+    fitted: Harness,
 ) -> None:
     old = fitted.active().id
     broken = some_centres(4)
@@ -173,7 +173,7 @@ def test_an_unusable_vocabulary_is_refused_with_the_reason_and_changes_nothing(
     assert fitted.building() is None
 
 
-def test_switching_back_gives_the_descriptors_of_the_earlier_vocabulary(fitted: Workplace) -> None:
+def test_switching_back_gives_the_descriptors_of_the_earlier_vocabulary(fitted: Harness) -> None:
     first, before = fitted.active(), fitted.rows()
     fitted.fit(seed=1)
     assert not any(same(before[photo_id], row) for photo_id, row in fitted.rows().items())
@@ -188,11 +188,11 @@ def test_switching_back_gives_the_descriptors_of_the_earlier_vocabulary(fitted: 
     assert all(same(before[photo_id], row) for photo_id, row in rows.items())
 
 
-def test_a_switch_that_can_not_be_fails_with_the_reason(
-    fitted: Workplace, workplace_of: Callable[[str], Workplace]
+def test_an_impossible_switch_fails_with_the_reason(
+    fitted: Harness, harness_of: Callable[[str], Harness]
 ) -> None:
     old = fitted.active()
-    elsewhere = workplace_of("test-tiny-vlad")
+    elsewhere = harness_of("test-tiny-vlad")
     elsewhere.upload(1)
     foreign = elsewhere.fit().result
     assert foreign is not None
@@ -205,7 +205,7 @@ def test_a_switch_that_can_not_be_fails_with_the_reason(
     assert fitted.active().id == old.id
 
 
-def test_progress_is_never_negative_and_never_falls(averages: Workplace) -> None:
+def test_progress_of_a_model_change_is_monotonic(averages: Harness) -> None:
     averages.upload(1)
     averages.drain()
     (photo_id,) = photo_ids(averages)

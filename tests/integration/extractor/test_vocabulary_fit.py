@@ -40,14 +40,14 @@ from tests.integration.extractor.model_changes import (
     photo_ids,
     some_centres,
 )
-from tests.integration.workplace import FIT, Workplace, expected_row, same
+from tests.integration.harness import FIT, Harness, expected_row, same
 from tests.support.catalog_rows import failure_code, problem_of
 from tests.support.photos import photo_bytes
 
 pytestmark = pytest.mark.numerics
 
 
-def test_a_fit_replaces_the_generation_while_the_old_one_answers(fitted: Workplace) -> None:
+def test_a_fit_replaces_the_generation_while_the_old_one_answers(fitted: Harness) -> None:
     old, before = fitted.active(), fitted.rows()
     version = _version(fitted)
     job_id = fitted.start(JobKind.FIT, **{**FIT, "seed": 1})
@@ -93,12 +93,12 @@ def test_a_fit_replaces_the_generation_while_the_old_one_answers(fitted: Workpla
     assert fitted.reindex_jobs(new.id) == []
 
 
-def _version(workplace: Workplace) -> int:
-    with workplace.catalog.read() as session:
-        return session.get_one(Map, workplace.map_id).version
+def _version(harness: Harness) -> int:
+    with harness.catalog.read() as session:
+        return session.get_one(Map, harness.map_id).version
 
 
-def test_few_photos_give_few_clusters(vlads: Workplace) -> None:
+def test_few_photos_give_few_clusters(vlads: Harness) -> None:
     vlads.upload(1, 2, 3)
     job = vlads.fit(clusters=64)
     assert job.result is not None
@@ -111,26 +111,26 @@ def test_few_photos_give_few_clusters(vlads: Workplace) -> None:
 
 
 def test_a_fit_that_names_no_number_makes_as_many_clusters_as_the_extractors_name_says(
-    workplace_of: Callable[[str], Workplace],
+    harness_of: Callable[[str], Harness],
 ) -> None:
-    workplace = workplace_of("test-tiny-vlad:clusters=2")
-    workplace.upload(1, 2, 3)
-    job = workplace.fit(clusters=None)
+    harness = harness_of("test-tiny-vlad:clusters=2")
+    harness.upload(1, 2, 3)
+    job = harness.fit(clusters=None)
     assert job.state == JobState.SUCCEEDED
-    generation = workplace.active()
+    generation = harness.active()
     assert (generation.extractor, generation.spec["clusters"]) == ("test-tiny-vlad:clusters=2", 2)
-    assert workplace.vocabulary(generation.vocabulary_id).provenance["clusters_asked"] == 2
-    assert workplace.fit(clusters=3, seed=1).result is not None
-    assert workplace.active().spec["clusters"] == 3, "what a fit says goes before the name"
+    assert harness.vocabulary(generation.vocabulary_id).provenance["clusters_asked"] == 2
+    assert harness.fit(clusters=3, seed=1).result is not None
+    assert harness.active().spec["clusters"] == 3, "what a fit says goes before the name"
 
 
-def test_a_fit_without_photos_that_can_be_decoded_fails_with_the_reason(vlads: Workplace) -> None:
+def test_a_fit_without_photos_that_can_be_decoded_fails_with_the_reason(vlads: Harness) -> None:
     assert failure_code(vlads.fit()) == "no_photos"
     vlads.upload_bytes(b"nothing")
     assert failure_code(vlads.fit()) == "no_photos"
 
 
-def test_an_extractor_without_vocabulary_has_nothing_to_fit_or_import(averages: Workplace) -> None:
+def test_an_extractor_without_vocabulary_has_nothing_to_fit_or_import(averages: Harness) -> None:
     averages.upload(1)
     averages.drain()
     generation = averages.active().id
@@ -140,12 +140,12 @@ def test_an_extractor_without_vocabulary_has_nothing_to_fit_or_import(averages: 
 
 
 def test_a_fit_that_is_computed_in_a_child_process_gives_the_same_vocabulary(
-    fitted: Workplace,
-    workplace_of: Callable[[str], Workplace],
+    fitted: Harness,
+    harness_of: Callable[[str], Harness],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The child opens the catalog and the store of the settings itself."""
-    with_child = workplace_of("test-tiny-vlad")
+    with_child = harness_of("test-tiny-vlad")
     with_child.upload(*range(PHOTOS))
     reported: list[tuple[str | None, int]] = []
     real = JobProgress.update
@@ -172,9 +172,9 @@ def test_a_fit_that_is_computed_in_a_child_process_gives_the_same_vocabulary(
     with_child.finish(job_id)
     ours, expected = (
         decode_centres(
-            workplace.store.get(workplace.vocabulary(workplace.active().vocabulary_id).object_key)
+            harness.store.get(harness.vocabulary(harness.active().vocabulary_id).object_key)
         )
-        for workplace in (with_child, fitted)
+        for harness in (with_child, fitted)
     )
     # The child has other threads, which sum in another order.
     np.testing.assert_allclose(ours.array, expected.array, atol=1e-3)
@@ -185,7 +185,7 @@ def test_a_fit_that_is_computed_in_a_child_process_gives_the_same_vocabulary(
 
 
 def test_a_fit_whose_process_is_killed_is_tried_again_and_then_fails(
-    fitted: Workplace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    fitted: Harness, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     old = fitted.active().id
     deaths = itertools.count(1)
@@ -206,7 +206,7 @@ def test_a_fit_whose_process_is_killed_is_tried_again_and_then_fails(
     assert fitted.active().id == old
 
 
-def test_photos_that_arrive_meanwhile_are_in_both_generations(fitted: Workplace) -> None:
+def test_photos_that_arrive_meanwhile_are_in_both_generations(fitted: Harness) -> None:
     old = fitted.active().id
     job_id, new = fitted.build(seed=1)
     fitted.advance()  # reindex jobs for what is there now
@@ -225,7 +225,7 @@ def test_photos_that_arrive_meanwhile_are_in_both_generations(fitted: Workplace)
 
 
 def test_a_photo_that_is_being_described_at_the_switch_ends_up_in_the_new_generation(
-    fitted: Workplace, monkeypatch: pytest.MonkeyPatch
+    fitted: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     old = fitted.active().id
     job_id, new = fitted.build(seed=1)
@@ -252,7 +252,7 @@ def test_a_photo_that_is_being_described_at_the_switch_ends_up_in_the_new_genera
 
 
 def test_each_run_queues_another_chunk_however_little_time_it_has(
-    fitted: Workplace, monkeypatch: pytest.MonkeyPatch
+    fitted: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reindex_jobs, "SLICE_SECONDS", -1.0)
     fitted.upload(101)
@@ -270,7 +270,7 @@ def test_each_run_queues_another_chunk_however_little_time_it_has(
     assert fitted.finish(job_id).state == JobState.SUCCEEDED
 
 
-def test_deleted_photos_are_not_waited_for(fitted: Workplace) -> None:
+def test_a_model_change_does_not_wait_for_deleted_photos(fitted: Harness) -> None:
     job_id, new = fitted.build(seed=1)
     before, after, *rest = photo_ids(fitted)
     fitted.delete(before)  # before it was queued for the new generation
@@ -287,7 +287,7 @@ def test_deleted_photos_are_not_waited_for(fitted: Workplace) -> None:
     assert set(fitted.rows(new)) == set(rest)
 
 
-def test_all_photos_deleted_meanwhile_leave_an_empty_generation(fitted: Workplace) -> None:
+def test_all_photos_deleted_meanwhile_leave_an_empty_generation(fitted: Harness) -> None:
     job_id, new = fitted.build(seed=1)
     fitted.advance()
     for photo_id in photo_ids(fitted):
@@ -297,15 +297,15 @@ def test_all_photos_deleted_meanwhile_leave_an_empty_generation(fitted: Workplac
     assert fitted.searchable() == 0
 
 
-def spoil(workplace: Workplace, photo_id: UUID) -> None:
+def spoil(harness: Harness, photo_id: UUID) -> None:
     """Replace the photo's stored bytes by others that are no photo."""
-    with workplace.catalog.read() as session:
+    with harness.catalog.read() as session:
         key = session.get_one(Photo, photo_id).object_key
-    workplace.store.put(key, b"the disk has rotted")
+    harness.store.put(key, b"the disk has rotted")
 
 
 def test_a_photo_that_fails_in_the_new_generation_is_recorded_and_blocks_nothing(
-    fitted: Workplace, monkeypatch: pytest.MonkeyPatch
+    fitted: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(model_changes, "MAX_LOST_SHARE", 1 / PHOTOS)
     job_id, new = fitted.build(seed=1)
@@ -328,7 +328,7 @@ def test_a_photo_that_fails_in_the_new_generation_is_recorded_and_blocks_nothing
 
 @pytest.mark.parametrize("later_changes", [0, 1])
 def test_a_photo_that_failed_in_a_generation_is_described_when_it_is_queued_again(
-    fitted: Workplace, later_changes: int, monkeypatch: pytest.MonkeyPatch
+    fitted: Harness, later_changes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(model_changes, "MAX_LOST_SHARE", 1 / PHOTOS)
     bad = photo_ids(fitted)[0]
@@ -349,7 +349,7 @@ def test_a_photo_that_failed_in_a_generation_is_described_when_it_is_queued_agai
     assert bad in fitted.rows()
 
 
-def test_a_reindex_job_that_someone_cancelled_is_made_anew(fitted: Workplace) -> None:
+def test_a_cancelled_reindex_job_is_queued_again(fitted: Harness) -> None:
     job_id, new = fitted.build(seed=1)
     fitted.advance()
     first = fitted.reindex_jobs(new)[0]
@@ -360,7 +360,7 @@ def test_a_reindex_job_that_someone_cancelled_is_made_anew(fitted: Workplace) ->
 
 
 def test_photos_of_a_chunk_that_was_discarded_after_it_was_queued_are_described_again(
-    fitted: Workplace,
+    fitted: Harness,
 ) -> None:
     job_id, new = fitted.build(seed=1)
     fitted.advance()
@@ -373,7 +373,7 @@ def test_photos_of_a_chunk_that_was_discarded_after_it_was_queued_are_described_
 
 
 def test_a_change_that_loses_more_than_one_per_cent_of_the_searchable_photos_fails(
-    fitted: Workplace,
+    fitted: Harness,
 ) -> None:
     old = fitted.active().id
     job_id, new = fitted.build(seed=1)
@@ -391,8 +391,8 @@ def test_a_change_that_loses_more_than_one_per_cent_of_the_searchable_photos_fai
     assert fitted.fit(seed=1).state == JobState.SUCCEEDED
 
 
-def test_photos_that_were_not_searchable_are_no_loss_and_are_tried_again_by_the_next_change(
-    vlads: Workplace,
+def test_photos_that_failed_before_do_not_count_as_lost_and_are_described_again(
+    vlads: Harness,
 ) -> None:
     photos = vlads.upload(*range(3))
     spoil(vlads, photos[0])
@@ -414,20 +414,20 @@ def test_photos_that_were_not_searchable_are_no_loss_and_are_tried_again_by_the_
     assert vlads.job_of(photos[0]).state == JobState.SUCCEEDED
 
 
-def failed_photos(workplace: Workplace) -> set[UUID]:
-    with workplace.catalog.read() as session:
-        return set(session.scalars(select_failed_photos(workplace.map_id)))
+def failed_photos(harness: Harness) -> set[UUID]:
+    with harness.catalog.read() as session:
+        return set(session.scalars(select_failed_photos(harness.map_id)))
 
 
-def test_a_steward_that_forgot_what_it_queued_queues_nothing_twice(fitted: Workplace) -> None:
+def test_a_restarted_steward_queues_no_reindex_job_twice(fitted: Harness) -> None:
     _, new = fitted.build(seed=1)
     fitted.advance()
     advance_model_changes(fitted.catalog, fitted.wakeups)
     assert len(fitted.reindex_jobs(new)) == PHOTOS
 
 
-def test_what_a_switch_leaves_is_completed_in_small_transactions(
-    fitted: Workplace, monkeypatch: pytest.MonkeyPatch
+def test_jobs_left_by_a_killed_switch_are_settled_in_small_transactions(
+    fitted: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reindex_jobs, "REINDEX_JOBS_PER_TRANSACTION", 2)
     monkeypatch.setattr(reindex_jobs, "DELETED_JOBS_PER_TRANSACTION", 2)

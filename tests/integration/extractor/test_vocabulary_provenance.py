@@ -16,7 +16,7 @@ from shared.extractor_config.configs import get_extractor_config
 from shared.imaging import preprocessing
 from shared.jobs import JobKind, JobState
 from tests.integration.extractor.model_changes import WIDTH, import_file
-from tests.integration.workplace import Workplace
+from tests.integration.harness import Harness
 from tests.support.catalog_rows import failure_code, problem_of
 
 
@@ -32,11 +32,11 @@ def vocabulary_file(**provenance: Any) -> bytes:
     return VocabularyFile(centres, fields).encode()
 
 
-def active_vocabulary(workplace: Workplace) -> Vocabulary:
-    return workplace.vocabulary(workplace.active().vocabulary_id)
+def active_vocabulary(harness: Harness) -> Vocabulary:
+    return harness.vocabulary(harness.active().vocabulary_id)
 
 
-def test_a_fitted_vocabulary_says_what_it_was_fitted_on(vlads: Workplace) -> None:
+def test_a_fitted_vocabulary_says_what_it_was_fitted_on(vlads: Harness) -> None:
     vlads.upload(*range(6))
     vlads.upload_bytes(b"nobody can decode this")
     assert vlads.fit(clusters=4, seed=5).state == JobState.SUCCEEDED
@@ -57,7 +57,7 @@ def test_a_fitted_vocabulary_says_what_it_was_fitted_on(vlads: Workplace) -> Non
     assert 10 < passes <= 20
 
 
-def test_an_imported_vocabulary_keeps_what_its_file_says(vlads: Workplace) -> None:
+def test_an_imported_vocabulary_keeps_what_its_file_says(vlads: Harness) -> None:
     vlads.upload(1)
     job = vlads.finish(import_file(vlads, vocabulary_file(note="Turin"), "turin.npz"))
     assert job.state == JobState.SUCCEEDED
@@ -74,7 +74,7 @@ def test_an_imported_vocabulary_keeps_what_its_file_says(vlads: Workplace) -> No
 
 
 def test_after_another_version_of_the_preprocessing_only_what_may_fit_is_switched_to(
-    vlads: Workplace, monkeypatch: pytest.MonkeyPatch
+    vlads: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vlads.upload(*range(6))
     bare = encode_centres(parse_centres(np.eye(3, WIDTH, dtype=np.float32)))

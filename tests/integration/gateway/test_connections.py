@@ -11,7 +11,7 @@ import resource
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from ipaddress import ip_network
 from typing import Any
@@ -25,6 +25,7 @@ from services.http_server import PEER_ADDRESS, http_server, listen
 from services.request_log import RequestLogMiddleware, RequestRecord
 from shared.config.settings import Settings
 from shared.http.problem_details import CLIENT_GONE, install_exception_handlers
+from tests.support.waiting import wait_until
 
 LONG = 30.0
 ASK = b"GET /whoami HTTP/1.1\r\nHost: localhost\r\n\r\n"
@@ -48,12 +49,6 @@ class Running:
         with self.connect(source) as client:
             client.sendall(ASK)
             return answer_of(client)
-
-    def wait_for(self, happened: Callable[[], object]) -> None:
-        deadline = time.monotonic() + LONG
-        while not happened():
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
 
 
 @contextlib.contextmanager
@@ -94,7 +89,7 @@ def serving(**limits: Any) -> Iterator[Running]:
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         try:
-            running.wait_for(lambda: server.started)
+            wait_until(lambda: server.started)
             yield running
         finally:
             running.hold.set()
@@ -153,7 +148,7 @@ def test_where_every_connection_is_at_work_a_further_one_is_refused(
     with serving(**limits) as server, server.connect() as one, server.connect() as two:
         for client in (one, two):
             client.sendall(ASK.replace(b"whoami", b"held"))
-        server.wait_for(lambda: server.connections.count == 2 and not server.connections._idle)
+        wait_until(lambda: server.connections.count == 2 and not server.connections._idle)
         answer = server.ask()
         assert answer.startswith(b"HTTP/1.1 " + status)
         assert b"too_many_connections" in answer
@@ -194,7 +189,7 @@ def test_a_head_that_does_not_come_in_time_ends_the_connection() -> None:
             retained.sendall(b"GET /")
             assert b"408 Request Timeout" in read_to_the_end(retained), "not within one"
         assert server.connections.closed[Reason.SLOW_HEAD] == 3
-        server.wait_for(lambda: server.connections.count == 0)
+        wait_until(lambda: server.connections.count == 0)
 
 
 def test_a_body_that_comes_too_slowly_is_answered_408_and_no_error_is_logged(
@@ -215,7 +210,7 @@ def test_a_body_that_comes_too_slowly_is_answered_408_and_no_error_is_logged(
             assert answer.startswith(b"HTTP/1.1 408 Request Timeout")
             assert b"request_too_slow" in answer
             read_to_the_end(unread)
-        server.wait_for(lambda: len(server.calls) == 3)
+        wait_until(lambda: len(server.calls) == 3)
         assert server.connections.closed[Reason.SLOW_BODY] == 2
         assert sorted(call.status for call in server.calls) == [200, 404, 408]
     assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
@@ -243,7 +238,7 @@ def test_a_client_that_disconnects_counts_as_499_without_a_traceback(
         with server.connect() as client:
             client.sendall(HEAD + b"x")
             time.sleep(0.2)
-        server.wait_for(lambda: server.calls)
+        wait_until(lambda: server.calls)
         assert server.calls[0].status == CLIENT_GONE
     assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
 
@@ -257,9 +252,9 @@ def test_a_response_that_the_client_does_not_read_ends_the_connection() -> None:
             while time.monotonic() < until:
                 assert reading.recv(1_000_000)
                 time.sleep(0.01)
-            server.wait_for(lambda: server.connections.closed[Reason.SLOW_READER] == 1)
+            wait_until(lambda: server.connections.closed[Reason.SLOW_READER] == 1)
             assert reading.recv(65536)
-        server.wait_for(lambda: server.connections.count == 0)
+        wait_until(lambda: server.connections.count == 0)
 
 
 def test_accept_errors_are_counted_and_one_line_a_minute_is_logged(
@@ -332,7 +327,7 @@ def test_a_trusted_proxy_is_unlimited_on_a_server_for_ipv4_and_ipv6(
 def test_the_total_limit_holds_under_concurrent_connects() -> None:
     with serving(total=30, per_address=0) as server, contextlib.ExitStack() as held:
         clients = [held.enter_context(server.connect()) for _ in range(300)]
-        server.wait_for(lambda: server.connections.closed[Reason.TOTAL_LIMIT] == 270)
+        wait_until(lambda: server.connections.closed[Reason.TOTAL_LIMIT] == 270)
         assert server.connections.count == 30
         assert b"200 OK" in server.ask()
         assert sum(1 for client in clients if is_open(client)) <= 30

@@ -13,22 +13,22 @@ from services.steward.tasks.compaction import merge_small_chunks
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole
 from shared.jobs import JobKind, JobState
+from tests.integration.harness import FIT, Harness
 from tests.integration.in_process_api import Service
-from tests.integration.workplace import FIT, Workplace
 from tests.support.photos import near_copy, photo_bytes
 
 
-def become(workplace: Workplace, role: PhotoRole, *photo_ids: UUID) -> None:
+def become(harness: Harness, role: PhotoRole, *photo_ids: UUID) -> None:
     """As `PATCH /uploads/{file_id}` does it."""
-    with workplace.catalog.write() as session:
-        lock_map(session, workplace.map_id)
+    with harness.catalog.write() as session:
+        lock_map(session, harness.map_id)
         for photo_id in photo_ids:
             photo = session.get_one(Photo, photo_id)
             photo.role = role
-            photo.changed_version = increment_map_version(session, workplace.map_id)
+            photo.changed_version = increment_map_version(session, harness.map_id)
 
 
-def test_a_query_keeps_its_descriptor_through_merging_and_a_model_change(vlads: Workplace) -> None:
+def test_a_query_keeps_its_descriptor_through_merging_and_a_model_change(vlads: Harness) -> None:
     photo_ids = vlads.upload(0, 1, 2, 3)
     become(vlads, PhotoRole.QUERY, photo_ids[1])
     vlads.fit()
@@ -50,7 +50,7 @@ def test_a_query_keeps_its_descriptor_through_merging_and_a_model_change(vlads: 
 
 
 def test_a_vocabulary_is_fitted_on_database_photos_only(
-    vlads: Workplace, monkeypatch: pytest.MonkeyPatch
+    vlads: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photo_ids = vlads.upload(*range(8))
     become(vlads, PhotoRole.QUERY, *photo_ids[::2])
@@ -71,7 +71,7 @@ def test_a_vocabulary_is_fitted_on_database_photos_only(
 
 
 @pytest.mark.usefixtures("fit_at_four_photos")
-def test_waiting_queries_do_not_make_a_map_fit_a_vocabulary(vlads: Workplace) -> None:
+def test_waiting_queries_do_not_make_a_map_fit_a_vocabulary(vlads: Harness) -> None:
     """The fit would find nothing to learn from, and after a failure none begins by itself."""
     queries = vlads.upload(0, 1, 2)
     become(vlads, PhotoRole.QUERY, *queries)
@@ -84,7 +84,7 @@ def test_waiting_queries_do_not_make_a_map_fit_a_vocabulary(vlads: Workplace) ->
 
 
 def test_a_fit_of_queries_alone_says_that_there_is_nothing_to_learn_from(
-    vlads: Workplace,
+    vlads: Harness,
 ) -> None:
     become(vlads, PhotoRole.QUERY, *vlads.upload(0, 1))
     job = vlads.finish(vlads.start(JobKind.FIT, **FIT))

@@ -193,10 +193,10 @@ def test_a_job_committed_after_the_deletion_is_cancelled_before_the_removal(
     with catalog.write() as session:
         job = add_job(session, map_id, photo_id=add_photo(session, map_id).id)
 
-    def away(*_: Any) -> bool:
+    def away(*_: Any, **__: Any) -> bool:
         raise Away
 
-    monkeypatch.setattr(delete_maps, "_purge_chunks", away)
+    monkeypatch.setattr(delete_maps, "delete_chunks", away)
     with pytest.raises(Away):
         purge_deleted_maps(catalog, store)
     assert read_job(catalog, job.id).state == JobState.CANCELLED

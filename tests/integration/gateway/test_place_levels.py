@@ -83,6 +83,17 @@ def test_the_levels_of_a_path_are_listed_finest_first_and_ever_more_probable(
     assert ask(tower, 0, "tower", certainty=1)["estimate"]["answer_level"] is None
 
 
+def test_the_maps_share_of_queries_from_elsewhere_counts_unless_the_request_names_one(
+    tower: Service,
+) -> None:
+    assert tower.json("GET", "/maps/tower")["elsewhere"] == 0.33
+    assert tower.json("PATCH", "/maps/tower", json={"elsewhere": 0.1})["elsewhere"] == 0.1
+    for share, params in ((0.1, {}), (0.5, {"elsewhere": 0.5})):
+        estimate = ask(tower, 0, "tower", **params)["estimate"]
+        assert (estimate["elsewhere"], estimate["not_in_map_probability"]) == (share, share)
+    problem(tower("PATCH", "/maps/tower", json={"elsewhere": 1}), 422, "invalid_field")
+
+
 def test_a_level_filters_photos_below_it_and_an_exact_label_only_its_own(tower: Service) -> None:
     def found(**params: Any) -> set[str]:
         images = tower.json("GET", "/search", params={"map": "tower", **params})["images"]

@@ -25,11 +25,11 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.installation import open_installation_store
 from shared.config.settings import Settings
 from shared.ids import new_id
-from shared.jobs import Job, JobKind, JobState, celery_wakeups
-from shared.jobs.celery_wakeups import (
+from shared.jobs import Job, JobKind, JobState, celery_messages
+from shared.jobs.celery_messages import (
     BROKER_TIMEOUT_SECONDS,
     MAX_QUEUED,
-    CeleryWakeups,
+    CeleryJobMessages,
     create_celery_app,
     encode_message,
 )
@@ -42,6 +42,7 @@ from tests.support.photos import photo_bytes
 from tests.support.processes import PLACEWISE, start
 from tests.support.server import environment
 from tests.support.servers import PostgresServer, RedisServer, start_redis
+from tests.support.waiting import wait_until
 
 SECONDS = 60.0
 
@@ -59,8 +60,8 @@ def app(own_redis: RedisServer) -> Celery:
 
 
 @pytest.fixture
-def wakeups(app: Celery, own_redis: RedisServer) -> Iterator[CeleryWakeups]:
-    made = CeleryWakeups(app, Settings(redis_url=own_redis.url))
+def wakeups(app: Celery, own_redis: RedisServer) -> Iterator[CeleryJobMessages]:
+    made = CeleryJobMessages(app, Settings(redis_url=own_redis.url))
     yield made
     made.close()
 
@@ -75,15 +76,8 @@ def message(number: int = 0, kind: JobKind = JobKind.INDEX) -> JobMessage:
     return JobMessage(new_id(), kind, WakeupQueue.BULK, "harbour", f"{number}.jpg")
 
 
-def until(condition) -> None:  # type: ignore[no-untyped-def]
-    deadline = time.monotonic() + SECONDS
-    while not condition():
-        assert time.monotonic() < deadline, "it did not come to that"
-        time.sleep(0.05)
-
-
 def test_celery_reads_a_message_that_names_the_job_its_map_and_its_file(
-    wakeups: CeleryWakeups, app: Celery
+    wakeups: CeleryJobMessages, app: Celery
 ) -> None:
     job = message(7, JobKind.REINDEX)
     wakeups.send(job)
@@ -103,32 +97,32 @@ def test_flower_is_configured_with_the_queues_of_messages() -> None:
 
 
 def test_the_messages_of_claimed_jobs_are_withdrawn_and_those_of_others_stay(
-    wakeups: CeleryWakeups, app: Celery, client: Redis
+    wakeups: CeleryJobMessages, app: Celery, client: Redis
 ) -> None:
     jobs = [message(number) for number in range(5)]
     wakeups.send(*jobs)
-    until(lambda: client.llen(WakeupQueue.BULK) == 5)
+    wait_until(lambda: client.llen(WakeupQueue.BULK) == 5)
     wakeups.claimed(jobs[1], jobs[4])
-    until(lambda: client.llen(WakeupQueue.BULK) == 3)
+    wait_until(lambda: client.llen(WakeupQueue.BULK) == 3)
     left = [encode_message(app, jobs[number]).encode() for number in (3, 2, 0)]
     assert client.lrange(WakeupQueue.BULK, 0, -1) == left
 
 
 def test_a_queue_holds_few_messages_however_many_are_sent(
-    wakeups: CeleryWakeups, client: Redis
+    wakeups: CeleryJobMessages, client: Redis
 ) -> None:
     for _ in range(3):
         wakeups.send(*(message(number) for number in range(MAX_QUEUED // 2)))
         time.sleep(0.1)
-    until(lambda: client.llen(WakeupQueue.BULK) == MAX_QUEUED)
+    wait_until(lambda: client.llen(WakeupQueue.BULK) == MAX_QUEUED)
     wakeups.send(message())
     wakeups.send(last := JobMessage(new_id(), JobKind.FIT, WakeupQueue.MODEL, "harbour", None))
-    until(lambda: client.llen(last.queue) == 1)
+    wait_until(lambda: client.llen(last.queue) == 1)
     assert client.llen(WakeupQueue.BULK) == MAX_QUEUED
 
 
 def test_without_redis_a_message_neither_waits_nor_raises_and_the_next_one_arrives(
-    wakeups: CeleryWakeups, client: Redis, own_redis: RedisServer
+    wakeups: CeleryJobMessages, client: Redis, own_redis: RedisServer
 ) -> None:
     assert own_redis.process is not None
     own_redis.process.kill()
@@ -136,31 +130,31 @@ def test_without_redis_a_message_neither_waits_nor_raises_and_the_next_one_arriv
     for number in range(100):
         wakeups.send(message(number))
     assert time.monotonic() - begun < BROKER_TIMEOUT_SECONDS
-    until(lambda: wakeups.problem is not None)
+    wait_until(lambda: wakeups.problem is not None)
     own_redis.process.start()
-    until(lambda: wakeups.problem is None)
+    wait_until(lambda: wakeups.problem is None)
     wakeups.send(message())
-    until(lambda: client.llen(WakeupQueue.BULK) > 0)
+    wait_until(lambda: client.llen(WakeupQueue.BULK) > 0)
 
 
 def test_a_full_redis_takes_events_and_no_messages(
-    wakeups: CeleryWakeups, app: Celery, client: Redis
+    wakeups: CeleryJobMessages, app: Celery, client: Redis
 ) -> None:
     client.config_set("maxmemory-policy", "noeviction")
     client.config_set("maxmemory", "1")
     with client.pubsub() as listening:  # type: ignore[no-untyped-call]
         listening.psubscribe("/0.celeryev/*")
         wakeups.send(message())
-        until(lambda: wakeups.problem is not None and "maxmemory" in wakeups.problem)
-        until(lambda: (heard := listening.get_message()) and heard["type"] == "pmessage")
+        wait_until(lambda: wakeups.problem is not None and "maxmemory" in wakeups.problem)
+        wait_until(lambda: (heard := listening.get_message()) and heard["type"] == "pmessage")
     client.config_set("maxmemory", "0")
-    until(lambda: wakeups.problem is None)
+    wait_until(lambda: wakeups.problem is None)
 
 
 def test_closing_in_the_middle_of_a_burst_takes_no_time(
-    wakeups: CeleryWakeups, monkeypatch: pytest.MonkeyPatch
+    wakeups: CeleryJobMessages, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(celery_wakeups, "DEBOUNCE_SECONDS", 0.5)
+    monkeypatch.setattr(celery_messages, "DEBOUNCE_SECONDS", 0.5)
     wakeups.send(message())
     time.sleep(0.2)
     begun = time.monotonic()
@@ -222,7 +216,7 @@ def done(catalog: Catalog) -> dict[str, int]:
 
 
 def test_a_thread_that_redis_does_not_answer_is_stuck_unless_redis_answers_nobody(
-    wakeups: CeleryWakeups,
+    wakeups: CeleryJobMessages,
     app: Celery,
     own_redis: RedisServer,
     monkeypatch: pytest.MonkeyPatch,
@@ -242,11 +236,11 @@ def test_a_thread_that_redis_does_not_answer_is_stuck_unless_redis_answers_nobod
     threads = start_service_threads(node.threads(), stop)
     assert own_redis.process is not None
     own_redis.process.kill()
-    until(lambda: wakeups.problem is not None)
+    wait_until(lambda: wakeups.problem is not None)
     time.sleep(4.0)
     assert node.stuck_thread() is None, "nobody gets an answer"
     own_redis.process.start()
-    until(lambda: node.stuck_thread() is not None)
+    wait_until(lambda: node.stuck_thread() is not None)
     assert node.stuck_thread() == "messages", "the other thread connects again"
     stop.set()
     hang.set()
@@ -272,7 +266,7 @@ def test_an_extractor_runs_queued_jobs_whatever_happens_to_the_messages(
     tmp_path: Path,
     catalog_on_postgres: Catalog,
     map_id: UUID,
-    wakeups: CeleryWakeups,
+    wakeups: CeleryJobMessages,
     client: Redis,
     extractor: Extractor,
 ) -> None:
@@ -284,7 +278,7 @@ def test_an_extractor_runs_queued_jobs_whatever_happens_to_the_messages(
             upload(catalog_on_postgres, store, map_id, photo_bytes(next(photos)))
 
     put(20)  # before the extractor came, or while it starts: no message is sent
-    until(lambda: done(catalog_on_postgres) == {JobState.SUCCEEDED: 20})
+    wait_until(lambda: done(catalog_on_postgres) == {JobState.SUCCEEDED: 20})
 
     for text in MALFORMED:
         for queue in WakeupQueue:
@@ -295,26 +289,26 @@ def test_an_extractor_runs_queued_jobs_whatever_happens_to_the_messages(
     ask(catalog_on_postgres, store, map_id, photo_bytes(3))
     resend_wakeups(catalog_on_postgres, wakeups)  # the steward's task
     resend_wakeups(catalog_on_postgres, wakeups)  # two of one are harmless
-    until(lambda: done(catalog_on_postgres) == {JobState.SUCCEEDED: 41})
+    wait_until(lambda: done(catalog_on_postgres) == {JobState.SUCCEEDED: 41})
     resend_wakeups(catalog_on_postgres, wakeups)
-    until(lambda: not client.keys("placewise*"))
+    wait_until(lambda: not client.keys("placewise*"))
 
     put(5)
     client.flushall()
-    until(lambda: done(catalog_on_postgres) == {JobState.SUCCEEDED: 46})
+    wait_until(lambda: done(catalog_on_postgres) == {JobState.SUCCEEDED: 46})
 
     extractor.process.terminate()
     assert extractor.process.wait(timeout=30) == 0
     put(5)
     extractor.start()
-    until(lambda: done(catalog_on_postgres) == {JobState.SUCCEEDED: 51})
+    wait_until(lambda: done(catalog_on_postgres) == {JobState.SUCCEEDED: 51})
 
 
 def test_the_steward_sends_lost_messages_and_withdraws_those_of_jobs_that_wait_no_longer(
     tmp_path: Path,
     catalog_on_postgres: Catalog,
     map_id: UUID,
-    wakeups: CeleryWakeups,
+    wakeups: CeleryJobMessages,
     client: Redis,
 ) -> None:
     store = FolderStore(tmp_path / "objects", exclusive=False)
@@ -326,9 +320,9 @@ def test_the_steward_sends_lost_messages_and_withdraws_those_of_jobs_that_wait_n
         ids = session.scalars(select(Job.id)).all()
         twice = read_job_messages(session, ids[:1])
     assert resend_wakeups(catalog_on_postgres, wakeups) == 4
-    until(lambda: client.llen(WakeupQueue.BULK) == 4)
+    wait_until(lambda: client.llen(WakeupQueue.BULK) == 4)
     wakeups.send(message(), *twice)  # the first of a job that was deleted since
-    until(lambda: client.llen(WakeupQueue.BULK) == 6)
+    wait_until(lambda: client.llen(WakeupQueue.BULK) == 6)
     with catalog_on_postgres.write() as session:
         cancelled = session.scalars(select(Job).order_by(Job.id)).first()
         assert cancelled is not None
@@ -342,7 +336,7 @@ def test_the_steward_sends_lost_messages_and_withdraws_those_of_jobs_that_wait_n
             heard = listening.get_message()
             return bool(heard and b"task-revoked" in _event_text(heard["data"]))
 
-        until(revoked)
+        wait_until(revoked)
 
 
 def _event_text(data: Any) -> bytes:

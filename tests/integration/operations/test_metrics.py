@@ -28,8 +28,8 @@ from shared.errors import Misconfigured
 from shared.jobs import InProcessWakeups, JobState
 from shared.storage import FolderStore
 from shared.telemetry.metrics_server import serve_metrics
+from tests.integration.harness import Harness
 from tests.integration.in_process_api import Service
-from tests.integration.workplace import Workplace
 from tests.support.catalog_rows import add_job, add_map, expire_lease, take
 from tests.support.metrics import ADDED, exported, read
 from tests.support.photos import photo_bytes
@@ -155,7 +155,7 @@ def test_the_queue_is_counted_by_kind_and_state_with_the_age_of_its_oldest(
     assert all(0 <= oldest_seconds < 300 for *_, oldest_seconds in counted)
 
 
-def test_an_extractor_counts_its_batches_stages_and_losses(averages: Workplace) -> None:
+def test_an_extractor_counts_its_batches_stages_and_losses(averages: Harness) -> None:
     averages.upload(1, 2, 3)
     averages.drain()
     metrics: Any = averages.worker._metrics

@@ -17,8 +17,8 @@ from shared.catalog.photos import Photo
 from shared.integrity.verify import IntegrityReport, repair_descriptors, verify_store
 from shared.jobs import InProcessWakeups
 from shared.storage.chunks import features_key, manifest_key
+from tests.integration.harness import Harness
 from tests.integration.in_process_api import Service
-from tests.integration.workplace import Workplace
 from tests.support.catalog_rows import add_reconstruction
 
 
@@ -146,7 +146,7 @@ def test_a_changed_original_is_found_by_its_hash_and_a_missing_one_without(
     assert mend(service, report) == 0
 
 
-def test_a_generation_that_is_being_built_gets_its_lost_rows_again(vlads: Workplace) -> None:
+def test_a_generation_that_is_being_built_gets_its_lost_rows_again(vlads: Harness) -> None:
     vlads.upload(*range(10))
     vlads.fit()
     job_id, building = vlads.build(seed=1)
@@ -166,7 +166,7 @@ def test_a_generation_that_is_being_built_gets_its_lost_rows_again(vlads: Workpl
     assert verify_store(vlads.catalog, vlads.store, originals=True).faults == []
 
 
-def test_a_changed_vocabulary_is_found(vlads: Workplace) -> None:
+def test_a_changed_vocabulary_is_found(vlads: Harness) -> None:
     vlads.upload(*range(10))
     vlads.fit()
     (key,) = vlads.keys("vocabularies/")
@@ -183,7 +183,7 @@ def test_a_changed_vocabulary_is_found(vlads: Workplace) -> None:
 
 
 def test_a_vocabulary_that_is_deleted_while_it_is_verified_is_no_fault(
-    vlads: Workplace, monkeypatch: pytest.MonkeyPatch
+    vlads: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vlads.upload(*range(10))
     vlads.fit()

@@ -55,7 +55,7 @@ def similar(service: Service, photo: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("damage", ["flipped", "gone"])
-def test_the_rest_is_answered_and_the_chunk_named_until_it_is_repaired(
+def test_a_damaged_chunk_is_named_in_missing_until_it_is_repaired(
     service: Service, monkeypatch: pytest.MonkeyPatch, damage: str
 ) -> None:
     monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)

@@ -124,7 +124,7 @@ def test_a_killed_shard_is_named_and_the_others_answer_until_it_is_back(
     assert tier.port.status().unavailable == ()
 
 
-def test_a_killed_replica_is_not_noticed(places: SmallMap, tier_of: OpenTier) -> None:
+def test_searches_continue_when_a_replica_is_killed(places: SmallMap, tier_of: OpenTier) -> None:
     tier = tier_of(2, 2)
     everything = places.brute_force(VECTOR, 100)
     tier.servers[0][0].stop()
@@ -163,7 +163,7 @@ def test_every_shard_answers_at_least_the_requested_version(
         assert {hit.photo_id for hit in response.hits} == set(places.rows)
 
 
-def test_of_a_replica_that_is_behind_the_other_one_answers(
+def test_the_current_replica_answers_while_the_other_is_behind(
     places: SmallMap, tier_of: OpenTier, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tier = tier_of(1, 2)
@@ -188,7 +188,7 @@ def test_a_shard_that_stays_behind_is_named_at_the_deadline(
     assert time.monotonic() - started < 10
 
 
-def test_a_worker_that_hangs_costs_its_own_shard_alone(
+def test_a_search_worker_that_hangs_leaves_only_its_shard_missing(
     places: SmallMap, tier_of: OpenTier, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tier = tier_of(1, 1, timeout_seconds=2.0)  # enough for the other one on a busy machine
@@ -271,16 +271,6 @@ def test_a_filter_is_applied_in_every_shard(places: SmallMap, tier_of: OpenTier)
     expected = [hit for hit in places.brute_force(VECTOR, 100) if hit[0] in reference]
     assert_answers(response, expected)
     assert response.rows_scanned == len(reference)
-
-
-def test_equal_scores_of_all_shards_come_in_the_order_of_the_photos(
-    catalog: Catalog, store: FolderStore, tier_of: OpenTier
-) -> None:
-    places = SmallMap(catalog, store)
-    for slot in (2, 0, 1, 0):
-        places.add(np.repeat(VECTOR[np.newaxis], 3, axis=0), slot)
-    response = ask(tier_of(1, 1, 1), places, k=8)
-    assert [hit.photo_id for hit in response.hits] == sorted(places.rows)[:8]
 
 
 # --- status -----------------------------------------------------------------------------------

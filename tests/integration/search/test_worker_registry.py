@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import BinaryIO
@@ -31,9 +30,10 @@ from shared.search_api.protocol import SearchRequest
 from shared.storage import FolderStore, read_retries
 from shared.storage.chunks import encode_rows
 from shared.storage.keys import QUERIES
-from tests.integration.workplace import Workplace
+from tests.integration.harness import Harness
 from tests.support.catalog_rows import failure_code
 from tests.support.photos import photo_bytes
+from tests.support.waiting import wait_until
 
 PHOTOS = 5
 WAIT_SECONDS = 30.0
@@ -83,20 +83,20 @@ def register(catalog: Catalog, store: FolderStore, settings: Settings) -> Regist
 
 
 @pytest.fixture
-def fitted(vlads: Workplace) -> Workplace:
+def fitted(vlads: Harness) -> Harness:
     """A map with a vocabulary and PHOTOS described photos."""
     vlads.upload(*range(PHOTOS))
     assert vlads.fit().state == JobState.SUCCEEDED
     return vlads
 
 
-def complete(workplace: Workplace) -> tuple[UUID, UUID]:
+def complete(harness: Harness) -> tuple[UUID, UUID]:
     """A model change up to where all photos are described; its job and its generation."""
-    job_id, generation_id = workplace.build(seed=1)
+    job_id, generation_id = harness.build(seed=1)
     for _ in range(3):
-        workplace.advance()
-        workplace.drain()
-    workplace.advance()
+        harness.advance()
+        harness.drain()
+    harness.advance()
     return job_id, generation_id
 
 
@@ -118,13 +118,13 @@ def age(catalog: Catalog, name: str, seconds: float) -> None:
         )
 
 
-def found(registered: Registered, workplace: Workplace, generation: Generation) -> set[UUID]:
+def found(registered: Registered, harness: Harness, generation: Generation) -> set[UUID]:
     """The photos that the worker answers for the generation."""
     key = f"{QUERIES}{generation.id}.npy"
-    row = next(iter(workplace.rows(generation.id).values()))
-    workplace.store.put(key, encode_rows(row[None]))
-    with workplace.catalog.read() as session:
-        version = session.get_one(Map, workplace.map_id).version
+    row = next(iter(harness.rows(generation.id).values()))
+    harness.store.put(key, encode_rows(row[None]))
+    with harness.catalog.read() as session:
+        version = session.get_one(Map, harness.map_id).version
     request = SearchRequest(
         generation_id=generation.id,
         object_key=key,
@@ -139,7 +139,7 @@ def found(registered: Registered, workplace: Workplace, generation: Generation) 
 
 
 def test_a_generation_is_switched_in_once_the_slow_worker_has_loaded_it_too(
-    fitted: Workplace, register: Register, store: FolderStore
+    fitted: Harness, register: Register, store: FolderStore
 ) -> None:
     slow_store = HaltingStore(store)
     slow_store.go_on.set()
@@ -180,8 +180,8 @@ def test_a_generation_is_switched_in_once_the_slow_worker_has_loaded_it_too(
         assert len(found(worker, fitted, fitted.active())) == PHOTOS - 1
 
 
-def test_a_worker_that_dies_is_not_waited_for_for_ever(
-    fitted: Workplace, register: Register, catalog: Catalog
+def test_a_switch_does_not_wait_for_a_dead_search_worker(
+    fitted: Harness, register: Register, catalog: Catalog
 ) -> None:
     living, dying = register("living"), register("dying")
     job_id, new_id = complete(fitted)
@@ -197,8 +197,8 @@ def test_a_worker_that_dies_is_not_waited_for_for_ever(
     assert dying.worker.status().versions == {}
 
 
-def test_a_worker_that_lives_and_does_not_load_is_named_and_waited_for(
-    fitted: Workplace, register: Register, catalog: Catalog, caplog: pytest.LogCaptureFixture
+def test_a_switch_waits_for_a_live_search_worker_that_has_not_loaded_and_names_it(
+    fitted: Harness, register: Register, catalog: Catalog, caplog: pytest.LogCaptureFixture
 ) -> None:
     register("stuck-b")
     register("stuck-a")
@@ -222,7 +222,7 @@ def test_a_worker_that_lives_and_does_not_load_is_named_and_waited_for(
 
 @pytest.mark.parametrize("damage", ["truncated", "gone"])
 def test_a_damaged_chunk_of_what_is_built_is_described_again_and_then_switched_in(
-    fitted: Workplace, register: Register, monkeypatch: pytest.MonkeyPatch, damage: str
+    fitted: Harness, register: Register, monkeypatch: pytest.MonkeyPatch, damage: str
 ) -> None:
     worker = register("worker")
     job_id, new_id = complete(fitted)
@@ -252,7 +252,7 @@ def test_a_damaged_chunk_of_what_is_built_is_described_again_and_then_switched_i
 
 
 def test_a_chunk_that_only_its_worker_can_not_read_is_kept_and_loaded_before_the_switch(
-    fitted: Workplace, register: Register, monkeypatch: pytest.MonkeyPatch
+    fitted: Harness, register: Register, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
     worker = register("worker")
@@ -272,7 +272,7 @@ def test_a_chunk_that_only_its_worker_can_not_read_is_kept_and_loaded_before_the
 
 
 def test_a_model_change_whose_chunks_are_damaged_again_and_again_fails(
-    fitted: Workplace, register: Register, monkeypatch: pytest.MonkeyPatch
+    fitted: Harness, register: Register, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(generation_repair, "MAX_REPAIRED_CHUNKS", 0)
     monkeypatch.setattr(model_changes, "SLOW_LOAD_SECONDS", 0.0)
@@ -286,8 +286,8 @@ def test_a_model_change_whose_chunks_are_damaged_again_and_again_fails(
     assert fitted.active().id == old.id
 
 
-def test_a_shard_without_a_row_of_it_is_not_waited_for(
-    fitted: Workplace, register: Register
+def test_a_switch_does_not_wait_for_a_shard_without_rows(
+    fitted: Harness, register: Register
 ) -> None:
     first = register("first", "0/2")  # every photo is in slot 0
     register("second", "1/2")
@@ -299,7 +299,7 @@ def test_a_shard_without_a_row_of_it_is_not_waited_for(
 
 
 def test_a_photo_that_comes_while_search_loads_is_described_before_the_switch(
-    fitted: Workplace, register: Register
+    fitted: Harness, register: Register
 ) -> None:
     worker = register("worker")
     job_id, new_id = complete(fitted)
@@ -319,18 +319,6 @@ def test_a_photo_that_comes_while_search_loads_is_described_before_the_switch(
 # --- the entries -----------------------------------------------------------------------------
 
 
-def test_a_worker_reports_its_heartbeat_and_what_it_has_loaded(
-    fitted: Workplace, register: Register, catalog: Catalog
-) -> None:
-    worker = register("worker", "1/3")
-    (entry,) = entries(catalog)
-    assert (entry.name, entry.shard, entry.shards, entry.loaded) == ("worker", 1, 3, {})
-    worker.catch_up()
-    (entry,) = entries(catalog)
-    version = worker.worker.status().versions[fitted.active().id]
-    assert entry.loaded == {str(fitted.active().id): version}
-
-
 def test_a_running_worker_keeps_its_entry_fresh_and_removes_it_in_the_end(
     register: Register, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -342,10 +330,10 @@ def test_a_running_worker_keeps_its_entry_fresh_and_removes_it_in_the_end(
     age(catalog, "worker", 100)
     running.start()
     try:
-        _wait_until(lambda: _seconds_ago(catalog) < 50)
+        wait_until(lambda: _seconds_ago(catalog) < 50)
         with catalog.write() as session:  # by a steward that could not hear of it
             session.delete(session.get_one(RegisteredSearchWorker, worker.presence.id))
-        _wait_until(lambda: bool(entries(catalog)))
+        wait_until(lambda: bool(entries(catalog)))
     finally:
         stop.set()
         running.join()
@@ -358,14 +346,9 @@ def _seconds_ago(catalog: Catalog) -> float:
         return float((now - seen).total_seconds())
 
 
-def _wait_until(true: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + WAIT_SECONDS
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
-def test_the_steward_forgets_workers_that_are_dead(register: Register, catalog: Catalog) -> None:
+def test_the_steward_removes_the_entries_of_dead_workers(
+    register: Register, catalog: Catalog
+) -> None:
     register("living")
     register("dead")
     age(catalog, "living", SEARCH_WORKER_TIMEOUT_SECONDS - 5)

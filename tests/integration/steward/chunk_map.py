@@ -18,7 +18,7 @@ from shared.storage.chunks import features_key
 from shared.storage.feature_files import FeatureRows, read_feature_file
 from shared.storage.keys import TRASH
 from shared.storage.read_retries import ReadRetries
-from tests.integration.workplace import same
+from tests.integration.harness import same
 from tests.support.catalog_rows import (
     add_chunk,
     add_generation,

@@ -12,10 +12,10 @@ from shared.catalog.maps import get_or_create_default_map
 from shared.config.settings import Settings
 from shared.storage import FolderStore, OwnedStore
 from shared.storage.s3 import S3Store
+from tests.integration.evaluated_map import EvaluatedMap
 from tests.integration.in_process_api import Service
 from tests.integration.steward.batches import Batches
 from tests.integration.steward.chunk_map import ChunkMap
-from tests.integration.town import Town
 from tests.support.servers import S3Server
 
 
@@ -44,5 +44,5 @@ def on_s3(
 
 
 @pytest.fixture
-def town(catalog: Catalog, store: FolderStore) -> Town:
-    return Town(catalog, store)
+def city(catalog: Catalog, store: FolderStore) -> EvaluatedMap:
+    return EvaluatedMap(catalog, store)

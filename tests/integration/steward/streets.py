@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from shared.catalog.photos import PhotoRole
-from tests.integration.town import Seen, metres_north
+from tests.integration.evaluated_map import Seen, metres_north
 
 NOON = datetime(2024, 5, 6, 12, tzinfo=UTC)
 HOUR = timedelta(hours=1)

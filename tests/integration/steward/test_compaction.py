@@ -19,8 +19,8 @@ from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.photos import Photo
 from shared.storage.chunks import WrittenChunk, features_key, read_chunk, write_chunk
 from shared.storage.read_retries import ReadRetries
+from tests.integration.harness import same
 from tests.integration.steward.chunk_map import HOUR_SECONDS, ChunkMap, Features
-from tests.integration.workplace import same
 from tests.support.catalog_rows import row_of, stored_rows
 
 

@@ -23,15 +23,15 @@ from shared.search_api.protocol import (
     SearchResponse,
     SearchStatus,
 )
+from tests.integration.evaluated_map import EvaluatedMap, Watched
 from tests.integration.steward.streets import HOUR, NOON, STREETS, WITHOUT_PLACE, at, query
-from tests.integration.town import Town, Watched
 from tests.support.catalog_rows import delete, read_job
 
 
-def test_leave_one_out_recall_is_what_one_counts_by_hand(town: Town) -> None:
-    town.publish(STREETS)
-    town.publish(WITHOUT_PLACE)
-    figures = town.figures()
+def test_leave_one_out_recall_is_what_one_counts_by_hand(city: EvaluatedMap) -> None:
+    city.publish(STREETS)
+    city.publish(WITHOUT_PLACE)
+    figures = city.figures()
     assert figures["leave_one_out"] == {
         "queries": 8,
         "R@1": 2 / 8,
@@ -41,21 +41,21 @@ def test_leave_one_out_recall_is_what_one_counts_by_hand(town: Town) -> None:
     }
     assert figures["labelled_queries"] is None
     assert figures["radius_m"] == 25
-    (evaluation,) = town.evaluations()
+    (evaluation,) = city.evaluations()
     assert figures == {
         "evaluation_id": str(evaluation.id),
-        "generation_id": str(town.generation_id),
+        "generation_id": str(city.generation_id),
         **evaluation.figures,
     }
     assert (evaluation.searchable, evaluation.labelled_queries) == (17, 0)
     assert not evaluation.automatic
-    assert town.calibration() is not None
+    assert city.calibration() is not None
 
 
-def test_second_recall_leaves_out_the_frames_of_a_walk(town: Town) -> None:
+def test_second_recall_leaves_out_the_frames_of_a_walk(city: EvaluatedMap) -> None:
     """Each photo of the walk finds the next frame first; the photo of another day comes later."""
     spring = NOON + 240 * HOUR
-    town.publish(
+    city.publish(
         [
             (0, at(0, filename="gate.jpg", captured_at=NOON)),
             (1, at(0, 1, filename="tree.jpg", captured_at=NOON + timedelta(seconds=60))),
@@ -74,7 +74,7 @@ def test_second_recall_leaves_out_the_frames_of_a_walk(town: Town) -> None:
             (331, at(4, filename="2.jpg", relative_path="south/2.jpg")),
         ]
     )
-    figures = town.figures()
+    figures = city.figures()
     assert figures["leave_one_out"] == {
         "queries": 11,
         "R@1": 10 / 11,
@@ -92,18 +92,18 @@ def test_second_recall_leaves_out_the_frames_of_a_walk(town: Town) -> None:
     }
 
 
-def test_a_little_farther_than_the_radius_is_another_place(town: Town) -> None:
-    town.publish([(0, at(0)), (1, at(0, 24.9)), (90, at(1)), (91, at(1, 25.1))])
-    loo = town.figures()["leave_one_out"]
+def test_a_little_farther_than_the_radius_is_another_place(city: EvaluatedMap) -> None:
+    city.publish([(0, at(0)), (1, at(0, 24.9)), (90, at(1)), (91, at(1, 25.1))])
+    loo = city.figures()["leave_one_out"]
     assert (loo["queries"], loo["R@1"], loo["without_positive"]) == (2, 1, 2)
 
 
 def test_labelled_queries_are_counted_in_and_out_of_the_map_and_disturb_no_leave_one_out(
-    town: Town,
+    city: EvaluatedMap,
 ) -> None:
-    town.publish(STREETS)
-    before = town.figures()["leave_one_out"]
-    town.publish(
+    city.publish(STREETS)
+    before = city.figures()["leave_one_out"]
+    city.publish(
         [
             (1, query(**at(0, 5))),  # the first is right
             (3, query(**at(1, 5))),  # the first is right
@@ -113,7 +113,7 @@ def test_labelled_queries_are_counted_in_and_out_of_the_map_and_disturb_no_leave
             (60, query()),  # without a known place: no query
         ]
     )
-    figures = town.figures()
+    figures = city.figures()
     assert figures["leave_one_out"] == before
     labelled = figures["labelled_queries"]
     assert labelled["queries"] == 3
@@ -121,24 +121,24 @@ def test_labelled_queries_are_counted_in_and_out_of_the_map_and_disturb_no_leave
     assert labelled["out_of_map"] == 2
     assert labelled["same_session"] == 0
     assert labelled["median_error_of_right_ones_m"] < 25
-    evaluation = town.evaluations()[-1]
+    evaluation = city.evaluations()[-1]
     assert (evaluation.searchable, evaluation.labelled_queries) == (15, 5)
 
 
-def test_a_sample_is_of_its_size_and_comes_from_its_seed(town: Town) -> None:
-    town.publish([(7 * n, at(n)) for n in range(30)])  # each alone
-    requests = [queried_photos(town, sample=10, seed=seed) for seed in (1, 1, 2)]
+def test_a_sample_is_of_its_size_and_comes_from_its_seed(city: EvaluatedMap) -> None:
+    city.publish([(7 * n, at(n)) for n in range(30)])  # each alone
+    requests = [queried_photos(city, sample=10, seed=seed) for seed in (1, 1, 2)]
     # The sample comes first; then the neighbours of the photos that it finds.
     assert requests[0] == requests[1]
     assert set(requests[0][:10]) != set(requests[2][:10])
     assert all(10 <= len(ids) < 30 for ids in requests)
-    assert len(queried_photos(town, sample=1000, seed=0)) == 30
+    assert len(queried_photos(city, sample=1000, seed=0)) == 30
 
 
-def queried_photos(town: Town, **params: Any) -> list[UUID]:
+def queried_photos(city: EvaluatedMap, **params: Any) -> list[UUID]:
     """The photos that an evaluation searches with; a search may be repeated with a larger k."""
     seen: dict[UUID, None] = {}
-    search = town.search.search
+    search = city.search.search
 
     class Noting:
         def search(self, request: SearchRequest) -> SearchResponse:
@@ -146,16 +146,16 @@ def queried_photos(town: Town, **params: Any) -> list[UUID]:
             return search(request)
 
         def match(self, request: MatchRequest) -> MatchResponse:
-            return town.search.match(request)
+            return city.search.match(request)
 
         def estimate_pose(self, request: PoseRequest) -> PoseResponse:
-            return town.search.estimate_pose(request)
+            return city.search.estimate_pose(request)
 
         def status(self) -> SearchStatus:
-            return town.search.status()
+            return city.search.status()
 
-    town.start(**params)
-    assert town.work(Noting())
+    city.start(**params)
+    assert city.work(Noting())
     return list(seen)
 
 
@@ -164,34 +164,34 @@ def queried_photos(town: Town, **params: Any) -> list[UUID]:
     [(11.9 * HOUR, True), (-11.9 * HOUR, True), (12 * HOUR, False)],
 )
 def test_queries_of_the_session_of_their_match_refine_no_probability(
-    town: Town, later: timedelta, same: bool
+    city: EvaluatedMap, later: timedelta, same: bool
 ) -> None:
     """40 of them are right and 20 wrong: enough to learn from, if they were of another day."""
-    town.publish([(6 * n, at(n, captured_at=NOON)) for n in range(60)])
-    town.publish(
+    city.publish([(6 * n, at(n, captured_at=NOON)) for n in range(60)])
+    city.publish(
         [
             (6 * n + 1, query(**at(n if n < 40 else n - 20, captured_at=NOON + later)))
             for n in range(60)
         ]
     )
-    figures = town.figures()
+    figures = city.figures()
     assert figures["labelled_queries"]["same_session"] == (60 if same else 0)
     places = figures["places"]
     refined = places is not None and places["source"] == "labelled_queries"
     assert refined != same
 
 
-def test_a_photo_deleted_meanwhile_counts_neither_way(town: Town, catalog: Catalog) -> None:
-    photo_ids = town.publish([(0, at(0)), (1, at(0)), (90, at(1)), (91, at(1))])
-    asking = town.publish([(2, query(**at(0))), (92, query(**at(1)))])
-    job_id = town.start()
+def test_a_photo_deleted_meanwhile_counts_neither_way(city: EvaluatedMap, catalog: Catalog) -> None:
+    photo_ids = city.publish([(0, at(0)), (1, at(0)), (90, at(1)), (91, at(1))])
+    asking = city.publish([(2, query(**at(0))), (92, query(**at(1)))])
+    job_id = city.start()
 
     def delete_some() -> None:
         for gone in (photo_ids[3], asking[1]):
-            delete(catalog, town.map_id, gone)
+            delete(catalog, city.map_id, gone)
             _forget(catalog, gone)
 
-    town.work(Watched(town.search, 1, delete_some))
+    city.work(Watched(city.search, 1, delete_some))
     result = read_job(catalog, job_id).result
     assert result is not None
     assert result["leave_one_out"]["queries"] == 3
@@ -204,20 +204,20 @@ def _forget(catalog: Catalog, photo_id: UUID) -> None:
         session.execute(sql.delete(Descriptor).where(Descriptor.photo_id == photo_id))
 
 
-def test_chunks_merged_and_removed_meanwhile_change_no_figure(town: Town) -> None:
+def test_chunks_merged_and_removed_meanwhile_change_no_figure(city: EvaluatedMap) -> None:
     """The query photo has another reference then: it is looked up again."""
     for begin in range(0, len(STREETS), 3):
-        town.publish(STREETS[begin : begin + 3])
-    before = town.figures()["leave_one_out"]
+        city.publish(STREETS[begin : begin + 3])
+    before = city.figures()["leave_one_out"]
 
     def merge() -> None:
-        assert merge_slot(town.catalog, town.store, town.generation_id, 0)
-        collect_superseded_chunks(town.catalog, town.store, grace_seconds=0)
-        town.search.sync()
+        assert merge_slot(city.catalog, city.store, city.generation_id, 0)
+        collect_superseded_chunks(city.catalog, city.store, grace_seconds=0)
+        city.search.sync()
 
-    job_id = town.start()
-    town.work(Watched(town.search, 4, merge))
-    result = read_job(town.catalog, job_id).result
+    job_id = city.start()
+    city.work(Watched(city.search, 4, merge))
+    result = read_job(city.catalog, job_id).result
     assert result is not None
     assert result["leave_one_out"] == before
 
@@ -232,9 +232,9 @@ def _label(kind: str, place: int) -> str | None:
     return labels[kind][place % len(labels[kind])]
 
 
-def _publish_pairs(town: Town, places: int, **columns: Any) -> None:
+def _publish_pairs(city: EvaluatedMap, places: int, **columns: Any) -> None:
     """Two photos of each place side by side; `columns` compute their values from the place."""
-    town.publish(
+    city.publish(
         [
             (
                 place * 360 / places + view * 90 / places,
@@ -246,19 +246,19 @@ def _publish_pairs(town: Town, places: int, **columns: Any) -> None:
     )
 
 
-def _use_paths(town: Town) -> None:
-    with town.catalog.write() as session:
-        map_ = session.get_one(Map, town.map_id)
+def _use_paths(city: EvaluatedMap) -> None:
+    with city.catalog.write() as session:
+        map_ = session.get_one(Map, city.map_id)
         map_.place_labels_are_paths, map_.place_labels_are_automatic = True, False
 
 
 @pytest.mark.parametrize(("kind", "max_levels"), [("empty levels", 2), ("mixed depths", 5)])
 def test_labels_with_empty_levels_or_mixed_depths_are_evaluated(
-    town: Town, kind: str, max_levels: int
+    city: EvaluatedMap, kind: str, max_levels: int
 ) -> None:
-    _use_paths(town)
-    _publish_pairs(town, 40, place=lambda place: _label(kind, place))
-    places = town.figures()["places"]
+    _use_paths(city)
+    _publish_pairs(city, 40, place=lambda place: _label(kind, place))
+    places = city.figures()["places"]
     assert places["source"] == "own_photos"
     assert 1 <= len(places["levels"]) <= max_levels
     assert places["levels"][0]["samples"] > 0
@@ -283,29 +283,29 @@ def test_labels_with_empty_levels_or_mixed_depths_are_evaluated(
     ids=["paths", "names", "paths beside coordinates"],
 )
 def test_an_evaluation_decides_by_the_labels_whether_they_are_paths(
-    town: Town, columns: dict[str, Any], levels: int
+    city: EvaluatedMap, columns: dict[str, Any], levels: int
 ) -> None:
-    _publish_pairs(town, 40, **columns)
-    assert len(town.figures()["places"]["levels"]) == levels
-    with town.catalog.read() as session:
-        assert session.get_one(Map, town.map_id).place_labels_are_paths == (levels == 3)
+    _publish_pairs(city, 40, **columns)
+    assert len(city.figures()["places"]["levels"]) == levels
+    with city.catalog.read() as session:
+        assert session.get_one(Map, city.map_id).place_labels_are_paths == (levels == 3)
 
 
 @pytest.mark.parametrize("labels_are_paths", [False, True])
 def test_labels_that_disagree_with_the_coordinates_are_evaluated(
-    town: Town, labels_are_paths: bool
+    city: EvaluatedMap, labels_are_paths: bool
 ) -> None:
     if labels_are_paths:
-        _use_paths(town)
+        _use_paths(city)
     _publish_pairs(
-        town,
+        city,
         40,
         place=lambda place: f"tower/{place % 4}/{place}",
         latitude=lambda place: float(place * 7 % 40),
         longitude=lambda _: 7.0,
     )
-    town.publish([(1, at(39, place="tower/0/0"))])  # the label of one place, the spot of another
-    places = town.figures()["places"]
+    city.publish([(1, at(39, place="tower/0/0"))])  # the label of one place, the spot of another
+    places = city.figures()["places"]
     assert places["source"] == "own_photos"
     assert len(places["levels"]) == (3 if labels_are_paths else 5)
     assert places["levels"][-1]["accuracy"] > 0.5

@@ -15,10 +15,10 @@ from shared.jobs import JobState, progress
 from shared.jobs.runner import reclaim_expired_leases
 from shared.jobs.transitions import cancel_job, retry_job
 from shared.storage import read_retries
+from tests.integration.evaluated_map import EvaluatedMap, Watched
 from tests.integration.in_process_api import Service
 from tests.integration.steward.batches import Killed
 from tests.integration.steward.streets import STREETS, WITHOUT_PLACE
-from tests.integration.town import Town, Watched
 from tests.support.catalog_rows import add_generation, expire_lease, failure_code, read_job
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
@@ -30,113 +30,113 @@ def look_always(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress, "PROGRESS_SECONDS", 0.0)
 
 
-def cancel(town: Town, job_id: UUID) -> None:
-    with town.catalog.write() as session:
-        cancel_job(get_job(session, town.map_id, job_id, lock=True))
+def cancel(city: EvaluatedMap, job_id: UUID) -> None:
+    with city.catalog.write() as session:
+        cancel_job(get_job(session, city.map_id, job_id, lock=True))
 
 
 @pytest.mark.usefixtures("look_always")
-def test_a_cancelled_evaluation_ends_soon_and_leaves_nothing(town: Town) -> None:
-    town.publish(STREETS)
-    job_id = town.start()
+def test_a_cancelled_evaluation_ends_soon_and_leaves_nothing(city: EvaluatedMap) -> None:
+    city.publish(STREETS)
+    job_id = city.start()
 
-    search = Watched(town.search, 2, lambda: cancel(town, job_id))
-    assert town.work(search)
+    search = Watched(city.search, 2, lambda: cancel(city, job_id))
+    assert city.work(search)
     assert search.searches <= 3
-    assert read_job(town.catalog, job_id).state == JobState.CANCELLED
-    assert town.evaluations() == []
-    assert town.calibration() is None
-    assert not town.work()
+    assert read_job(city.catalog, job_id).state == JobState.CANCELLED
+    assert city.evaluations() == []
+    assert city.calibration() is None
+    assert not city.work()
 
 
-def test_an_evaluation_cancelled_at_the_last_moment_leaves_nothing(town: Town) -> None:
-    town.publish(STREETS)
-    job_id = town.start()
+def test_an_evaluation_cancelled_at_the_last_moment_leaves_nothing(city: EvaluatedMap) -> None:
+    city.publish(STREETS)
+    job_id = city.start()
 
-    town.work(Watched(town.search, len(STREETS), lambda: cancel(town, job_id)))
-    assert read_job(town.catalog, job_id).state == JobState.CANCELLED
-    assert (town.evaluations(), town.calibration()) == ([], None)
-    with town.catalog.write() as session:
-        retry_job(session, get_job(session, town.map_id, job_id, lock=True))
-    assert town.work()
-    assert len(town.evaluations()) == 1
+    city.work(Watched(city.search, len(STREETS), lambda: cancel(city, job_id)))
+    assert read_job(city.catalog, job_id).state == JobState.CANCELLED
+    assert (city.evaluations(), city.calibration()) == ([], None)
+    with city.catalog.write() as session:
+        retry_job(session, get_job(session, city.map_id, job_id, lock=True))
+    assert city.work()
+    assert len(city.evaluations()) == 1
 
 
-def test_a_stopping_steward_gives_its_evaluation_to_the_next_one(town: Town) -> None:
-    town.publish(STREETS)
-    job_id = town.start()
+def test_a_stopping_steward_gives_its_evaluation_to_the_next_one(city: EvaluatedMap) -> None:
+    city.publish(STREETS)
+    job_id = city.start()
     stop = threading.Event()
-    search = Watched(town.search, 2, stop.set)
-    assert town.work(search, stop)
+    search = Watched(city.search, 2, stop.set)
+    assert city.work(search, stop)
     assert search.searches == 2
-    job = read_job(town.catalog, job_id)
+    job = read_job(city.catalog, job_id)
     assert (job.state, job.attempts, job.lease_token) == (JobState.QUEUED, 0, None)
-    assert town.evaluations() == []
-    assert town.work()
-    assert read_job(town.catalog, job_id).state == JobState.SUCCEEDED
+    assert city.evaluations() == []
+    assert city.work()
+    assert read_job(city.catalog, job_id).state == JobState.SUCCEEDED
 
 
 def kill() -> None:
     raise Killed
 
 
-def test_a_killed_evaluation_begins_anew(town: Town) -> None:
-    town.publish(STREETS)
-    job_id = town.start()
+def test_a_killed_evaluation_starts_from_the_beginning(city: EvaluatedMap) -> None:
+    city.publish(STREETS)
+    job_id = city.start()
     with pytest.raises(Killed):
-        town.work(Watched(town.search, 5, kill))
-    assert not town.work(), "its lease is not over"
-    expire_lease(town.catalog, job_id)
-    with town.catalog.write() as session:
+        city.work(Watched(city.search, 5, kill))
+    assert not city.work(), "its lease is not over"
+    expire_lease(city.catalog, job_id)
+    with city.catalog.write() as session:
         assert len(reclaim_expired_leases(session)) == 1
-    search = Watched(town.search, 0, kill)
-    assert town.work(search)
+    search = Watched(city.search, 0, kill)
+    assert city.work(search)
     assert search.searches >= len(STREETS)
-    job = read_job(town.catalog, job_id)
+    job = read_job(city.catalog, job_id)
     assert job.state == JobState.SUCCEEDED
     assert job.progress_done == job.progress_total == len(STREETS)
-    (evaluation,) = town.evaluations()
+    (evaluation,) = city.evaluations()
     assert evaluation.figures["leave_one_out"]["R@10"] == 7 / 8
 
 
-def test_an_evaluator_whose_lease_was_taken_over_commits_nothing(town: Town) -> None:
-    town.publish(STREETS)
-    job_id = town.start()
+def test_an_evaluator_whose_lease_was_taken_over_commits_nothing(city: EvaluatedMap) -> None:
+    city.publish(STREETS)
+    job_id = city.start()
 
     def take_over() -> None:
-        expire_lease(town.catalog, job_id)
-        with town.catalog.write() as session:
+        expire_lease(city.catalog, job_id)
+        with city.catalog.write() as session:
             reclaim_expired_leases(session)
-        assert town.work()
+        assert city.work()
 
-    assert town.work(Watched(town.search, 3, take_over))
-    assert len(town.evaluations()) == 1
-    assert read_job(town.catalog, job_id).state == JobState.SUCCEEDED
+    assert city.work(Watched(city.search, 3, take_over))
+    assert len(city.evaluations()) == 1
+    assert read_job(city.catalog, job_id).state == JobState.SUCCEEDED
 
 
 @pytest.mark.parametrize("order", [0, 1])
 def test_a_damaged_map_is_not_measured_by_its_rest(
-    town: Town, order: int, monkeypatch: pytest.MonkeyPatch
+    city: EvaluatedMap, order: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whether the broken chunk holds query photos, or only photos that may be found."""
     monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
-    town.publish(STREETS)
-    town.publish(WITHOUT_PLACE)
+    city.publish(STREETS)
+    city.publish(WITHOUT_PLACE)
     keys = sorted(
-        (info.key for info in town.store.list("chunks/") if info.key.endswith(".npy")),
-        key=lambda key: town.store.path(key).stat().st_mtime_ns,
+        (info.key for info in city.store.list("chunks/") if info.key.endswith(".npy")),
+        key=lambda key: city.store.path(key).stat().st_mtime_ns,
     )
-    whole = town.store.get(keys[order])
-    town.store.put(keys[order], whole[:-1])
-    job_id = town.start()
-    assert town.work()
-    job = read_job(town.catalog, job_id)
+    whole = city.store.get(keys[order])
+    city.store.put(keys[order], whole[:-1])
+    job_id = city.start()
+    assert city.work()
+    job = read_job(city.catalog, job_id)
     assert failure_code(job) == "map_damaged"
     assert keys[order] in str(job.error)
-    assert town.evaluations() == []
-    town.store.put(keys[order], whole)
-    town.search.sync()
-    assert town.figures()["leave_one_out"]["R@1"] == 2 / 8
+    assert city.evaluations() == []
+    city.store.put(keys[order], whole)
+    city.search.sync()
+    assert city.figures()["leave_one_out"]["R@1"] == 2 / 8
 
 
 def test_there_must_be_something_to_evaluate(service: Service) -> None:

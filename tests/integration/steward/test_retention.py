@@ -9,7 +9,6 @@ from uuid import UUID
 import pytest
 from sqlalchemy import select, update
 
-from services.steward.tasks import maintenance
 from services.steward.tasks.maintenance import JOB_RETENTION_DAYS as DAYS
 from services.steward.tasks.maintenance import delete_old_jobs, delete_old_searches
 from shared.catalog.database.base import db_now_plus
@@ -115,24 +114,3 @@ def test_searches_are_deleted_after_their_retention(service: Service, catalog: C
     found = service.json("GET", "/searches")["searches"]
     assert [search["search_id"] for search in found] == [recent]
     assert service.json("GET", "/database/stats")["total_searches"] == 1
-
-
-def test_deletions_are_split_into_transactions(
-    service: Service, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(maintenance, "RETENTION_ROWS_PER_TRANSACTION", 2)
-    with catalog.write() as session:
-        map_id = get_map(session, "default").id
-        for _ in range(5):
-            add_job(
-                session,
-                map_id,
-                JobKind.EVALUATE,
-                state=JobState.SUCCEEDED,
-                finished_at=db_now_plus(-2 * DAYS * DAY_SECONDS),
-            )
-    left = []
-    for _ in range(3):
-        delete_old_jobs(catalog)
-        left.append(len(jobs(catalog)))
-    assert left == [3, 1, 0]

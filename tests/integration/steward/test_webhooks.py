@@ -36,13 +36,13 @@ from shared.security.webhook_targets import WebhookTarget, parse_webhook_url
 from shared.storage import FolderStore
 from shared.storage.keys import preview_key
 from tests.integration.api_with_keys import ADMIN, Door
+from tests.integration.harness import Harness
 from tests.integration.steward.webhook_receiver import (
     Receiver,
     certificate,
     hanging_receiver,
     receiving,
 )
-from tests.integration.workplace import Workplace
 from tests.support.catalog_rows import end_pauses
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
@@ -415,7 +415,7 @@ def test_over_https_only_the_named_host_gets_deliveries(
 
 @BOTH_DATABASES
 def test_a_switched_generation_is_delivered_and_its_photos_are_not(
-    hooks: WebhookSetup, vlads: Workplace
+    hooks: WebhookSetup, vlads: Harness
 ) -> None:
     vlads.upload(*range(PHOTOS))
     assert vlads.fit().state == JobState.SUCCEEDED

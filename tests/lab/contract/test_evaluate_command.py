@@ -114,6 +114,16 @@ def charts_of(page: str) -> list[tuple[str, ET.Element]]:
     return [(title, ET.fromstring(base64.b64decode(svg))) for svg, title in found]
 
 
+def test_a_comparison_with_a_run_of_another_set_is_refused_before_anything_is_described(
+    city: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = ["--data", city, "--extractor", "test-tiny-avg"]
+    run("evaluate", *given, "--rule", "radius:10", "--out", tmp_path / "before")
+    monkeypatch.setattr("lab.cli.evaluation.data_sets.make_describer", None)
+    problem = run_json("evaluate", *given, "--against", tmp_path / "before", code=1)
+    assert problem["code"] == "runs_not_comparable"
+
+
 def test_an_evaluation_writes_figures_rankings_and_a_report_that_fetches_nothing(
     city: Path, town: EvaluationSet, tmp_path: Path
 ) -> None:

@@ -9,8 +9,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from services.cli.descriptors import local_weights
-from services.cli.descriptors.local_weights import WeightsRecord, suggest_extractor
 from services.cli.operations import installation_checks
 from services.cli.operations.installation_checks import check_device, check_extractor, check_memory
 from shared.config import settings as settings_module
@@ -95,50 +93,6 @@ def test_an_entry_of_torch_hub_is_tried_and_never_downloaded(
     monkeypatch.setenv("EXTRACTOR", f"torchhub:{write_hub(tmp_path / 'hub')}:colours")
     assert "load" in check_extractor(Settings())
     assert "is unknown until it is loaded" in check_memory(Settings())
-
-
-def test_a_better_extractor_is_suggested_where_its_weights_and_a_gpu_are_available(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    weights = save(random_weights(SHAPES["vits14"], blocks=11), tmp_path / "vits.pth")
-    assert suggest_extractor(settings_with(monkeypatch, DINO_WEIGHTS=tmp_path / "none")) is None
-    monkeypatch.setenv("DINO_WEIGHTS", str(weights))
-    suggestion = suggest_extractor(Settings())
-    assert suggestion is not None
-    assert "EXTRACTOR=anyloc-vits14 " in suggestion
-    assert "\n" not in suggestion
-    for name, value in (
-        ("DEVICE", "cpu"),
-        ("EXTRACTOR", "efficientnet-lite0-vlad128"),
-        ("DINO_MODEL", "dinov2_vits14"),
-    ):
-        with monkeypatch.context() as context:
-            context.setenv(name, value)
-            assert suggest_extractor(Settings()) is None, name
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert suggest_extractor(Settings()) is None
-
-
-def test_an_allowed_model_of_torch_hub_that_was_loaded_here_is_suggested_first(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    name = f"torchhub:{write_hub(tmp_path / 'hub')}:colours"
-    weights = save(random_weights(SHAPES["vits14"], blocks=11), tmp_path / "vits.pth")
-    settings = settings_with(monkeypatch, CODE_ALLOWED=name, DINO_WEIGHTS=weights)
-    assert "EXTRACTOR=anyloc-vits14 " in str(suggest_extractor(settings)), "never loaded"
-    monkeypatch.setattr(local_weights, "_load_record", lambda _key: WeightsRecord("f" * 64, 1))
-    assert f"EXTRACTOR={name} " in str(suggest_extractor(settings))
-
-
-def test_the_suggestion_follows_the_default_extractor(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(installation_checks, "suggest_extractor", lambda _settings: "a better one")
-    assert check_extractor(Settings()).endswith("; a better one")
 
 
 def test_missing_cuda_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,6 +18,7 @@ from tests.support.fake_server import FakeServer, running_server
 def test_create_sends_the_options_that_are_given(server: FakeServer) -> None:
     server.will_answer(201, MAP)
     options = ["--place-labels-are-paths", "--rows", "float16", "--matching", "off"]
+    options += ["--elsewhere", "0.05"]
     result = CliRunner().invoke(app, ["create", "tower", *options, "--server", server.url])
     assert result.exit_code == 0, result.output
     _, path, body = server.requests[0]
@@ -27,6 +28,7 @@ def test_create_sends_the_options_that_are_given(server: FakeServer) -> None:
         "place_labels_are_paths": True,
         "rows": "float16",
         "matching": "off",
+        "elsewhere": 0.05,
     }
 
 
@@ -45,6 +47,15 @@ def test_matching_on_waits_for_the_local_features_and_says_how_many_there_are(
     assert json.loads(server.requests[0][2]) == {"matching": "on"}
     assert server.requests[1][1].startswith(f"/api/v1/jobs/{JOB['job_id']}")
     assert "Map tower: matching on: 3 photos, 0.2 MB, used." in result.output
+
+
+def test_the_share_of_queries_from_elsewhere_is_changed(server: FakeServer) -> None:
+    server.will_answer(200, MAP | {"elsewhere": 0.05})
+    options = ["update", "tower", "--elsewhere", "0.05", "--server", server.url]
+    result = CliRunner().invoke(app, options)
+    assert result.exit_code == 0, result.output
+    assert json.loads(server.requests[0][2]) == {"elsewhere": 0.05}
+    assert "5.0 % from elsewhere" in result.output
 
 
 def test_update_without_a_change_is_refused() -> None:

@@ -18,7 +18,7 @@ import pytest
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
-from placewise.answers import OneTrack, Photo
+from placewise.answers import OneTrack
 from services.cli.track.frame_sources import (
     FrameTiming,
     Order,
@@ -32,7 +32,6 @@ from services.cli.track.track_files import (
     write_track_file,
 )
 from shared.errors import InvalidRequest, Misconfigured
-from tests.support.api_responses import PHOTO
 from tests.support.photos import photo_bytes, photo_image
 
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
@@ -227,12 +226,11 @@ RIDE = track_of(
 
 
 def test_files_of_a_track_have_its_frames_and_no_line_where_it_is_lost(tmp_path: Path) -> None:
-    photos = [Photo(**{**PHOTO, "latitude": 45.0, "longitude": 7.0})]
-    names = ("json", "csv", "gpx", "geojson", "png", "jpg")
+    names = ("json", "csv", "gpx", "geojson")
     files = {name: tmp_path / f"ride.{name}" for name in names}
     check_track_files(list(files.values()))
     for file in files.values():
-        write_track_file(file, RIDE, photos)
+        write_track_file(file, RIDE)
     assert json.loads(files["json"].read_text()) == json.loads(RIDE.model_dump_json())
     rows = list(csv.DictReader(files["csv"].read_text().splitlines()))
     assert tuple(rows[0]) == COLUMNS
@@ -258,35 +256,18 @@ def test_files_of_a_track_have_its_frames_and_no_line_where_it_is_lost(tmp_path:
         None,
         [7.0, 45.002],
     ]
-    for name, kind in (("png", "PNG"), ("jpg", "JPEG")):
-        with Image.open(files[name]) as picture:
-            assert (picture.format, picture.size) == (kind, (1200, 1200))
-            assert len(picture.convert("RGB").getcolors(1_000_000) or []) > 10
-
-
-def test_a_track_of_places_is_drawn_over_time(tmp_path: Path) -> None:
-    file = tmp_path / "walk.png"
-    write_track_file(file, track_of(state("tracking", None, "hall"), state("lost", None)), [])
-    with Image.open(file) as picture:
-        assert picture.size == (1200, 1200)
     assert located_segments(track_of(None)) == []
 
 
 def test_csv_cells_are_no_formulas_for_a_spreadsheet(tmp_path: Path) -> None:
     named = RIDE.frames[0].model_copy(update={"filename": "-1.jpg"})
-    write_track_file(tmp_path / "ride.csv", RIDE.model_copy(update={"frames": [named]}), [])
+    write_track_file(tmp_path / "ride.csv", RIDE.model_copy(update={"frames": [named]}))
     [row] = csv.DictReader((tmp_path / "ride.csv").read_text().splitlines())
     assert row["filename"] == "'-1.jpg"
 
 
-def test_files_that_can_not_be_written_are_refused_before_the_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_that_can_not_be_written_are_refused_before_the_work(tmp_path: Path) -> None:
     for bad in (tmp_path / "ride.txt", tmp_path / "missing" / "ride.csv"):
         with pytest.raises(InvalidRequest) as refusal:
             check_track_files([bad])
         assert refusal.value.code == "bad_out"
-    monkeypatch.setattr("services.cli.track.track_files.find_spec", lambda name: None)
-    check_track_files([tmp_path / "ride.csv"])
-    with pytest.raises(Misconfigured, match="matplotlib"):
-        check_track_files([tmp_path / "ride.png"])

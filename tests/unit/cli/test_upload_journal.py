@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from placewise.client import Client
 from services.cli.ingest.geotags import LocalPhoto, read_photo_manifest
 from services.cli.ingest.upload import upload_photos
 from services.cli.ingest.upload_journal import UploadJournal
-from shared.errors import InvalidRequest, NotFound
+from shared.errors import InvalidRequest
 from tests.support.api_responses import JOB, JOB_ID, PHOTO_ID, STATS, UPLOADED
 from tests.support.fake_server import FakeServer
 
@@ -82,27 +81,6 @@ def test_a_file_that_is_no_journal_is_refused_and_left_alone(path: Path) -> None
 
 def uploads(server: FakeServer) -> int:
     return sum(request[1].startswith("/api/v1/upload") for request in server.requests)
-
-
-def test_a_run_that_was_broken_off_sends_only_the_rest(
-    server: FakeServer, path: Path, photo: LocalPhoto, tmp_path: Path
-) -> None:
-    (tmp_path / "2.jpg").write_bytes(b"two")
-    photos = [photo, LocalPhoto(tmp_path / "2.jpg", {})]
-    with UploadJournal(path, server.url, None) as journal:
-        journal.add(photo, TAKEN)
-    server.will_answer(200, STATS)
-    server.will_answer(202, UPLOADED)
-    server.will_answer(404, NotFound("job_not_found", "Deleted.").as_problem())
-    for answer in (JOB, STATS, NO_JOBS, STATS):
-        server.will_answer(200, answer)
-    with Client(server.url) as client, UploadJournal(path, server.url, None) as journal:
-        report = upload_photos(client, photos, Progress(disable=True), journal=journal)
-    assert uploads(server) == 1
-    assert (report["uploaded"], report["already_there"]) == (1, 1)
-    assert report["refused"] == report["failed"] == []
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    assert [line.get("file_id") for line in lines] == [None, PHOTO_ID, PHOTO_ID]
 
 
 def test_photos_that_wait_for_a_vocabulary_are_not_waited_for_one_by_one(

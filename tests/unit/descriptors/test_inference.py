@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from services.extractor import model_registry
 from services.extractor.model_registry import ModelRegistry
 from shared.config.settings import Settings
+from shared.descriptors.backbones import Backbone
 from shared.descriptors.backbones.synthetic import TinyBackbone
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.inference import BatchSizeLimit, PhotoTooLargeForGpu, run_in_batches
@@ -103,8 +104,21 @@ def test_warming_up_is_a_pass_of_the_largest_size_and_finds_what_fits() -> None:
 
 
 def test_model_that_leaves_no_room_for_one_photo_is_refused_when_it_is_loaded() -> None:
-    with pytest.raises(Misconfigured, match="no memory left for a single photo") as caught:
+    with pytest.raises(Misconfigured, match="does not hold the weights") as caught:
         on(SmallGpu(0)).warm_up(16)
+    assert caught.value.code == "gpu_out_of_memory"
+
+
+def test_weights_that_do_not_fit_are_refused_by_the_same_code(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def load(*_: object) -> Backbone:
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB.")
+
+    monkeypatch.setattr(TinyBackbone, "load", load)
+    config = get_extractor_config("test-tiny-vlad", allow_test_extractors=True)
+    with pytest.raises(Misconfigured, match="does not hold the weights") as caught:
+        Extractor(config, CPU)
     assert caught.value.code == "gpu_out_of_memory"
 
 
@@ -117,7 +131,9 @@ def models(settings: Settings, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -
     )
 
 
-def test_what_fits_is_remembered_when_the_model_is_loaded_anew(models: ModelRegistry) -> None:
+def test_the_fitting_batch_size_is_kept_when_the_model_is_loaded_again(
+    models: ModelRegistry,
+) -> None:
     models.extractor("test-tiny-avg").limit.record_out_of_memory(2, SIDE * SIDE)
     first_backbone = weakref.ref(models.extractor("test-tiny-avg").backbone)
     other = models.extractor("test-slow-avg")

@@ -105,7 +105,7 @@ def test_fit_holds_no_matrix_of_the_dimension(tmp_path: Path) -> None:
     assert peak < result + 5_000_000, "the rows alone have 15.7 MB, and are never held together"
 
 
-def test_a_row_that_is_the_mean_or_nothing_becomes_zero_and_one_that_is_nan_stays_so() -> None:
+def test_whitening_maps_the_mean_and_zero_rows_to_zero_and_keeps_nan() -> None:
     by = fit_pca(unit_rows(70, 30), 5)
     rows = np.stack([by.mean, np.zeros(30, np.float32), np.full(30, np.nan, np.float32)])
     found = projected(rows, by)
@@ -158,7 +158,7 @@ def test_more_rows_and_no_fewer_dimensions_than_components_are_needed() -> None:
 
 
 @pytest.mark.parametrize("count", [30, 500])
-def test_photos_that_are_all_alike_bear_few_directions(count: int) -> None:
+def test_more_components_than_the_rows_vary_in_are_refused(count: int) -> None:
     few = unit_rows(count, 5) @ np.random.default_rng(2).standard_normal((5, 100))
     rows = few.astype(np.float32)
     assert "vary in 5 directions only" in refusal("pca_too_many_dimensions", rows, 10)
@@ -220,7 +220,7 @@ def test_a_whitening_fits_the_descriptors_that_it_was_learnt_from(fitted: PcaWhi
         ("rows", np.zeros(2, np.int64), "one number each"),
     ],
 )
-def test_files_that_would_spoil_descriptors_are_refused(
+def test_whitening_files_with_invalid_values_are_refused(
     fitted: PcaWhitening, name: str, value: NDArray[np.generic] | None, message: str
 ) -> None:
     stored = load(PcaWhiteningFile(fitted, None).encode())
@@ -231,7 +231,7 @@ def test_files_that_would_spoil_descriptors_are_refused(
     assert message in unusable(save(stored))
 
 
-def test_files_that_are_none_are_refused(fitted: PcaWhitening) -> None:
+def test_files_that_are_no_whitening_are_refused(fitted: PcaWhitening) -> None:
     data = PcaWhiteningFile(fitted, None).encode()
     for broken in (b"", b"\x93NUMPY", data[:-1], data[:100], data + b"x"):
         assert "or it is truncated" in unusable(broken)

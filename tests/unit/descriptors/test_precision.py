@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from timm.layers.layer_scale import LayerScale
 
 from shared.descriptors.aggregators.clustering import vlad
 from shared.descriptors.backbones import normalise_features
@@ -92,6 +93,32 @@ def test_half_precision_computes_otherwise_and_comes_near(
     assert not torch.equal(single, half)
     np.testing.assert_allclose(torch.linalg.norm(half, dim=-1), 1.0, atol=1e-5)
     assert float((single * half).sum(dim=-1).mean()) >= LEAST_PATCH_COSINE
+
+
+def test_half_precision_leaves_the_single_precision_network_as_it_is(
+    networks: dict[Precision, Extractor],
+) -> None:
+    before = networks["float32"].features(pixels(1))
+    networks["bfloat16"].features(pixels(1))
+    assert torch.equal(networks["float32"].features(pixels(1)), before)
+
+
+def test_half_precision_converts_no_matrix_and_scales_no_branch_in_a_pass(
+    networks: dict[Precision, Extractor],
+) -> None:
+    made = networks["bfloat16"]
+    made.features(pixels(1))
+    with torch.profiler.profile(record_shapes=True) as profile:
+        made.features(pixels(1))
+    vit = made.backbone._bfloat16_vit  # type: ignore[attr-defined]
+    assert not any(isinstance(module, LayerScale) for module in vit.modules())
+    matrices = {tuple(module.weight.shape) for module in vit.modules() if hasattr(module, "weight")}
+    converted = {
+        tuple(event.input_shapes[0])
+        for event in profile.events()
+        if event.name == "aten::_to_copy" and event.input_shapes
+    }
+    assert not matrices & converted
 
 
 def test_aggregation_is_in_single_precision(networks: dict[Precision, Extractor]) -> None:

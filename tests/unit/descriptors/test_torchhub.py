@@ -122,9 +122,7 @@ def test_changed_code_is_another_spec_and_is_what_runs(folder: Path) -> None:
     assert not np.allclose(after.describe(pixels, None), before.describe(pixels, None))
 
 
-def test_two_repositories_with_modules_of_one_name_do_not_meet(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_repositories_with_equal_module_names_are_kept_apart(folder: Path, tmp_path: Path) -> None:
     other = write_hub(tmp_path / "other")
     (other / "networks.py").write_text(NETWORKS.replace("dimension=24", "dimension=8"))
     assert "networks" not in sys.modules
@@ -179,7 +177,7 @@ def test_an_entry_that_is_no_extractor_is_refused_with_the_reason(
     assert message in refusal(folder, entry)
 
 
-def test_code_of_others_prints_nothing_into_an_answer(
+def test_output_of_torch_hub_code_does_not_reach_stdout(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     extractor(folder, "prints")

@@ -127,7 +127,7 @@ def test_anylocs_vocabularies_give_rows_of_the_published_dimension(
     np.testing.assert_allclose(row, unit(unit(expected).reshape(-1)), atol=1e-5)
 
 
-def test_first_of_equally_similar_centres_gets_the_patch_and_others_stay_exactly_zero() -> None:
+def test_a_patch_is_assigned_to_the_first_of_equally_similar_centres() -> None:
     centres = np.eye(4)
     patches = unit(np.array([[[1.0, 0.1, 0.0, 0.0], [0.1, 0.0, 1.0, 0.0]]]))
     blocks = vlad(tensor(patches), tensor(centres)).reshape(4, 4)

@@ -54,7 +54,7 @@ def _refuse_all(server: FilesServer) -> None:
     server.refuse = [503] * MAX_DOWNLOAD_ATTEMPTS
 
 
-def test_a_file_comes_whole_with_its_progress(server: FilesServer, target: Path) -> None:
+def test_a_download_reports_its_progress(server: FilesServer, target: Path) -> None:
     seen: list[tuple[int, int | None]] = []
     download_file(
         f"{server.url}/weights",
@@ -68,14 +68,14 @@ def test_a_file_comes_whole_with_its_progress(server: FilesServer, target: Path)
     assert not begun(target).exists()
 
 
-def test_a_break_costs_only_what_was_not_there_yet(server: FilesServer, target: Path) -> None:
+def test_an_interrupted_download_is_resumed(server: FilesServer, target: Path) -> None:
     server.break_after = [2_000_000, 1_000_000]
     download_file(f"{server.url}/weights", target, sha256=HASH)
     assert target.read_bytes() == CONTENT
     assert [part for _, part in server.requests] == [None, "bytes=2000000-", "bytes=3000000-"]
 
 
-def test_a_later_call_goes_on_where_an_earlier_one_ended(server: FilesServer, target: Path) -> None:
+def test_a_later_call_resumes_an_incomplete_download(server: FilesServer, target: Path) -> None:
     retained = break_off(server, target)
     assert 0 < retained <= 2_000_000
     assert not target.exists()
@@ -89,7 +89,9 @@ def test_a_later_call_goes_on_where_an_earlier_one_ended(server: FilesServer, ta
     assert seen[0] == retained
 
 
-def test_a_file_that_has_changed_meanwhile_comes_anew(server: FilesServer, target: Path) -> None:
+def test_a_file_that_changed_on_the_server_is_downloaded_from_the_start(
+    server: FilesServer, target: Path
+) -> None:
     break_off(server, target)
     server.refuse = []
     server.files["/weights"] = changed = CONTENT[::-1]

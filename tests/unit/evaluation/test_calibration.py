@@ -54,7 +54,9 @@ PAIRS: dict[str, tuple[PhotoLocation, PhotoLocation, bool]] = {
 
 
 @pytest.mark.parametrize(("one", "other", "same"), PAIRS.values(), ids=PAIRS.keys())
-def test_which_photos_show_one_place(one: PhotoLocation, other: PhotoLocation, same: bool) -> None:
+def test_labels_and_distances_decide_whether_photos_are_of_one_place(
+    one: PhotoLocation, other: PhotoLocation, same: bool
+) -> None:
     for here, there in ((one, other), (other, one)):
         assert is_same_place(here, there, 25) == same
 

@@ -58,7 +58,7 @@ def test_a_model_is_fetched_once_and_read_from_the_folder_then(
     assert bucket.fetched == 1
 
 
-def test_where_objects_are_files_nothing_is_copied(tmp_path: Path, folder: Path) -> None:
+def test_models_of_a_folder_store_are_read_in_place(tmp_path: Path, folder: Path) -> None:
     store = FolderStore(tmp_path / "objects")
     key, sha256 = put(store, b"weights")
     assert ModelFileCache(store, folder, 100).local_path(key, sha256).read_bytes() == b"weights"
@@ -69,7 +69,9 @@ def test_where_objects_are_files_nothing_is_copied(tmp_path: Path, folder: Path)
     assert caught.value.code == "model_corrupt"
 
 
-def test_a_spoilt_file_is_fetched_again(bucket: Bucket, folder: Path) -> None:
+def test_a_cached_model_file_with_a_wrong_hash_is_fetched_again(
+    bucket: Bucket, folder: Path
+) -> None:
     key, sha256 = put(bucket, b"weights")
     cache = ModelFileCache(bucket, folder, 100)
     cache.local_path(key, sha256).write_bytes(b"wei")
@@ -89,7 +91,9 @@ def test_a_file_with_a_wrong_hash_is_rejected_and_deleted(bucket: Bucket, folder
         ModelFileCache(bucket, folder, 100).local_path(key, sha256)
 
 
-def test_what_was_used_least_lately_makes_room(bucket: Bucket, folder: Path) -> None:
+def test_the_least_recently_used_model_is_evicted_from_the_cache(
+    bucket: Bucket, folder: Path
+) -> None:
     cache = ModelFileCache(bucket, folder, 25)
     stored = [put(bucket, bytes([number]) * 10) for number in range(4)]
     paths = [cache.local_path(*one) for one in stored[:3]]  # two fit beside the one that is fetched

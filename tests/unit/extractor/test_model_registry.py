@@ -33,14 +33,14 @@ def test_extractors_that_differ_in_what_follows_the_backbone_share_it(
     assert (vlad.config.clusters, average.config.aggregator) == (3, "avg")
 
 
-def test_extractors_used_least_lately_are_let_go(models: ModelRegistry) -> None:
+def test_the_least_recently_used_extractors_are_unloaded(models: ModelRegistry) -> None:
     first = models.extractor("test-tiny-vlad:clusters=1")
     for clusters in range(2, MAX_EXTRACTORS + 2):
         models.extractor(f"test-tiny-vlad:clusters={clusters}")
     assert models.extractor("test-tiny-vlad:clusters=1") is not first
 
 
-def test_code_that_is_no_longer_allowed_is_not_executed(
+def test_torchscript_whose_hash_is_no_longer_allowed_is_not_executed(
     store: FolderStore, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     name = f"torchhub:{write_hub(tmp_path / 'hub')}:colours"

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.gateway.schemas import CameraPoseResponse, EstimateResponse
 from services.gateway.similarity.estimate import estimate_place, locate_hits, place_at_pose
 from shared.catalog.photos import Photo
 from shared.evaluation.places.evidence import (
@@ -25,6 +24,7 @@ from shared.evaluation.places.probability import (
     PlaceModel,
     error_radius_m,
 )
+from shared.responses.similarity import CameraPoseResponse, EstimateResponse
 from shared.search_api.protocol import SearchHit
 from tests.support.api_responses import POSE
 

@@ -47,7 +47,7 @@ def test_resized_photo_has_the_same_view() -> None:
         ({"size": (5000, 3333)}, None),
     ],
 )
-def test_focal_length_of_exif(exif: dict[str, Any], expected: float | None) -> None:
+def test_focal_length_is_read_from_exif(exif: dict[str, Any], expected: float | None) -> None:
     width, height = exif["size"]
     resolution, unit = exif.get("plane", (None, None))
     found = focal_length_from_exif(

@@ -34,7 +34,7 @@ metres = st.floats(-2000, 2000)
 
 @pytest.mark.parametrize("place", PLACES.values(), ids=PLACES)
 @given(east=metres, north=metres, up=metres)
-def test_metres_lead_to_coordinates_and_back(
+def test_local_metres_and_coordinates_are_inverse(
     place: tuple[float, float], east: float, north: float, up: float
 ) -> None:
     plane = EastNorthUp(*place, 250.0)
@@ -50,7 +50,7 @@ def test_metres_lead_to_coordinates_and_back(
     )
 
 
-def test_directions_of_a_plane() -> None:
+def test_local_axes_point_east_north_and_up() -> None:
     plane = EastNorthUp(*PLACES["the antimeridian"])
     east = plane.to_geographic(np.array([100.0, 0.0, 0.0]))
     assert east.longitude == pytest.approx(-179.99915, abs=1e-4)
@@ -196,7 +196,7 @@ def test_covariance_contains_the_error_of_the_alignment(bias: bool) -> None:
         ("close", "its photos are too close to each other for the errors of their coordinates"),
     ],
 )
-def test_reason_why_a_component_is_not_aligned(change: str, reason: str) -> None:
+def test_component_that_is_not_aligned_has_a_reason(change: str, reason: str) -> None:
     walk = Walk(PLACES["Turin"], noise_m=0.5)
     if change == "two":
         walk.latitudes[2:] = np.nan

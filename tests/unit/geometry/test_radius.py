@@ -91,7 +91,7 @@ def test_heading_is_relative_to_north_at_the_position_itself() -> None:
     assert found.attitude.pitch == pytest.approx(0, abs=0.05)
 
 
-def test_map_without_altitudes_gives_none() -> None:
+def test_pose_in_a_map_without_altitudes_has_no_altitude() -> None:
     flat = replace(EXACT, knows_altitude=False)
     assert geo_pose(pose_at((0.0, 0.0, 1.0)), HERE, flat, CALIBRATION).altitude_m is None
 

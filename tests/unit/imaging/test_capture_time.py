@@ -41,7 +41,7 @@ def gps(day: str, *time: float) -> dict[str, Any]:
         ("2024:13:01 10:00:00", None),
     ],
 )
-def test_dates_are_read_as_cameras_write_them(text: str, expected: str | None) -> None:
+def test_exif_dates_are_parsed(text: str, expected: str | None) -> None:
     assert taken(clock(text)) == expected
 
 
@@ -59,9 +59,7 @@ def test_dates_are_read_as_cameras_write_them(text: str, expected: str | None) -
         *(("   :  ", None), ("", None), ("+99:00", None), ("+02:75", None), ("Europe/Paris", None)),
     ],
 )
-def test_an_offset_that_is_blank_or_broken_is_as_a_missing_one(
-    text: str, minutes: int | None
-) -> None:
+def test_a_blank_or_invalid_utc_offset_is_ignored(text: str, minutes: int | None) -> None:
     offset = None if minutes is None else timedelta(minutes=minutes)
     assert parse_offset(text) == offset
     found = read_time([clock("2024:05:01 10:00:00", text)])
@@ -116,7 +114,7 @@ def test_the_time_of_digitising_stands_in_for_a_missing_original() -> None:
         (gps("1970:01:18", 19, 5, 52), {}, None),
     ],
 )
-def test_a_gps_date_that_contradicts_the_clock_does_not_win(
+def test_a_gps_date_that_contradicts_the_camera_clock_is_ignored(
     of_gps: dict[str, Any], of_clock: dict[str, Any], expected: str | None
 ) -> None:
     assert taken(of_gps | of_clock) == expected

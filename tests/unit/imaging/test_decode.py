@@ -95,7 +95,7 @@ def test_every_exif_orientation_comes_out_upright(orientation: int, media: str) 
 
 
 @pytest.mark.parametrize("name", ["demo1024", "paper480x640", "round14"])
-def test_published_preprocessings_see_photos_as_they_are_stored(name: str) -> None:
+def test_published_preprocessings_ignore_the_exif_orientation(name: str) -> None:
     published = get_preprocessing(name)
     on_its_side = turned_photo(photo_image(1), 6, "PNG")
     decoded = decode_photo(on_its_side, published, PIXELS)
@@ -172,7 +172,7 @@ def test_truncated_photo_is_an_error_and_not_a_grey_picture(media: str) -> None:
     assert reason(whole[: len(whole) * 2 // 3]).code == "undecodable_photo"
 
 
-def test_what_is_no_photo_is_an_error_that_names_what_is_accepted() -> None:
+def test_a_file_that_is_no_photo_raises_an_error_that_lists_the_accepted_formats() -> None:
     others = [photo_bytes(1, media) for media in ("GIF", "PPM", "TGA")]
     for data in (b"", b"this is a text\n" * 40, *others):
         assert reason(data).code == "undecodable_photo"
@@ -265,7 +265,7 @@ def test_photos_that_are_large_or_that_browsers_do_not_show_get_a_preview(
             assert (image.format, image.size) == ("JPEG", preview_size)
 
 
-def test_broken_exif_is_no_reason_to_refuse_the_pixels() -> None:
+def test_photos_with_broken_exif_are_decoded() -> None:
     """A tag of text that holds a fraction: Pillow reads it, but can't write it again."""
     entry = struct.pack("<HHIHHII", 1, 0x010F, 0, 0, 0, 0, 0)
     for exif in (

@@ -309,7 +309,7 @@ def test_values_are_those_of_exiftool(compared: list[tuple[Variant, dict[str, An
         assert found.gps_error is None, variant.name
 
 
-def test_coordinates_without_a_sense_are_none_and_the_reason_is_given(
+def test_invalid_gps_coordinates_are_ignored_with_a_reason(
     compared: list[tuple[Variant, dict[str, Any]]],
 ) -> None:
     for variant, _ in compared:

@@ -133,7 +133,7 @@ AVIF = PHOTO.replace(b"ftypheic", b"ftypmif1").replace(b"hvc1", b"av01")
     ],
     ids=["AVIF", "2^63", "2^64-1", "offset", "length", "both"],
 )
-def test_what_only_begins_like_a_heic_is_refused(data: bytes, why: str) -> None:
+def test_a_file_with_a_heic_signature_and_no_photo_is_refused(data: bytes, why: str) -> None:
     assert detect_media_type(data[:16]) == "image/heic"
     with pytest.raises(Unprocessable) as caught:
         read_photo_header(io.BytesIO(data), PIXELS)
@@ -157,7 +157,7 @@ def test_exif_behind_an_item_of_several_extents_is_read_and_so_is_exif_in_severa
     assert read_photo_header(io.BytesIO(elsewhere), PIXELS).gps_error == error
 
 
-def test_no_damage_to_a_header_is_more_than_a_refusal() -> None:
+def test_a_damaged_heic_header_is_read_or_refused() -> None:
     """Each byte that is wrong, and each length at which a file may end."""
     rng = random.Random(1)
     end = PHOTO.index(b"mdat") + 64

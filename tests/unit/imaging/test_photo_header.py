@@ -122,7 +122,7 @@ def test_gps_position_is_read_in_all_four_hemispheres(
         {GPS.GPSLongitudeRef: None, GPS.GPSLongitude: None},
     ],
 )
-def test_position_out_of_range_or_half_is_left_out_whole(broken: Tags) -> None:
+def test_incomplete_or_out_of_range_gps_positions_are_ignored(broken: Tags) -> None:
     given = {**position("N", "E"), **broken}
     found = header(encoded(exif=exif_with({key: v for key, v in given.items() if v is not None})))
     assert (found.latitude, found.longitude) == (None, None)
@@ -132,14 +132,16 @@ def test_position_out_of_range_or_half_is_left_out_whole(broken: Tags) -> None:
 
 @pytest.mark.parametrize("zero", [(0.0, 0.0, 0.0), (IFDRational(0, 0),) * 3, (0.0,)])
 @pytest.mark.parametrize("letters", [("N", "E"), ("\0", "\0")])
-def test_null_island_is_no_place_and_no_error(zero: tuple[Any], letters: tuple[str, str]) -> None:
+def test_gps_coordinates_0_0_are_ignored_without_an_error(
+    zero: tuple[Any], letters: tuple[str, str]
+) -> None:
     gps = {**position(*letters), GPS.GPSLatitude: zero, GPS.GPSLongitude: zero}
     found = header(encoded(exif=exif_with(gps)))
     assert (found.latitude, found.longitude, found.gps_error) == (None, None, None)
 
 
 @pytest.mark.parametrize(("fields", "heading"), [(12.5, 12.5), (0, 0), (360, 0), (372.5, 12.5)])
-def test_heading_is_brought_below_360_degrees(fields: float, heading: float) -> None:
+def test_heading_is_normalised_to_below_360_degrees(fields: float, heading: float) -> None:
     found = header(encoded(exif=exif_with({GPS.GPSImgDirection: fields})))
     assert found.heading == pytest.approx(heading)
 
@@ -204,7 +206,7 @@ CAMERA_TIME: Tags = {
     ],
     ids=["GPS before the camera's", "camera's with its offset", "camera's counts as UTC"],
 )
-def test_time_is_that_of_the_gps_or_the_cameras_in_utc(
+def test_capture_time_is_the_gps_time_or_the_camera_time_in_utc(
     gps: Tags | None, camera: Tags, expected: datetime
 ) -> None:
     found = taken(gps, camera)
@@ -222,7 +224,7 @@ def test_time_is_that_of_the_gps_or_the_cameras_in_utc(
         {GPS.GPSDateStamp: "9999:12:31", GPS.GPSTimeStamp: (4e9, 0.0, 0.0)},
     ],
 )
-def test_broken_gps_time_gives_way_to_the_cameras(gps: Tags) -> None:
+def test_camera_time_is_used_where_the_gps_time_is_invalid(gps: Tags) -> None:
     assert taken(gps, CAMERA_TIME) == datetime(2024, 5, 6, 10, 20, 31, tzinfo=UTC)
 
 
@@ -234,7 +236,7 @@ def test_broken_gps_time_gives_way_to_the_cameras(gps: Tags) -> None:
         {Base.DateTimeOriginal: "0001:01:01 00:00:00", Base.OffsetTimeOriginal: "+05:00"},
     ],
 )
-def test_broken_camera_time_is_left_out(camera: Tags) -> None:
+def test_invalid_camera_time_is_ignored(camera: Tags) -> None:
     assert taken(None, camera) is None
 
 
@@ -261,7 +263,7 @@ def test_size_is_that_of_the_upright_photo(orientation: int, media: str) -> None
         (b"Exif\0\0II*\0\x08\0\0\0\xff\xff" + bytes(40), None),
     ],
 )
-def test_broken_exif_says_nothing_but_that_it_is_broken(exif: bytes, error: str | None) -> None:
+def test_broken_exif_yields_no_values_and_a_reason(exif: bytes, error: str | None) -> None:
     assert header(encoded(exif=exif)) == PhotoHeader(width=64, height=48, gps_error=error)
 
 
@@ -312,7 +314,7 @@ def whole_exif() -> bytes:
 
 @settings(max_examples=100, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), media=st.sampled_from(["JPEG", "PNG", "WEBP"]))
-def test_no_damage_to_the_exif_refuses_a_photo(seed: int, media: str) -> None:
+def test_photos_with_damaged_exif_are_accepted(seed: int, media: str) -> None:
     rng = random.Random(seed)
     exif = bytearray(whole_exif())
     for _ in range(rng.choice([1, 2, 10, 40])):

@@ -81,7 +81,9 @@ PUBLISHED = {"demo1024": demo1024, "paper480x640": paper480x640, "round14": roun
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_published_ways_give_the_published_numbers(name: str, size: tuple[int, int]) -> None:
+def test_published_preprocessings_give_the_published_pixel_values(
+    name: str, size: tuple[int, int]
+) -> None:
     image = photo(*size)
     pixels = get_preprocessing(name).apply(image)
     assert pixels.shape[0] % 14 == pixels.shape[1] % 14 == 0
@@ -116,7 +118,7 @@ def test_area_preprocessing_keeps_the_aspect_ratio_up_to_4_to_1(
     assert pixels.shape[0] * pixels.shape[1] <= found.max_pixels
 
 
-def test_what_needs_no_resizing_keeps_its_bytes() -> None:
+def test_photos_of_the_target_size_are_not_resampled() -> None:
     pixels = get_preprocessing("demo1024").apply(photo(480, 640))
     assert pixels.dtype == np.uint8
     np.testing.assert_array_equal(pixels, np.asarray(photo(480, 640))[2:478, 5:635])
@@ -131,7 +133,7 @@ def test_cubic_overshoot_is_neither_clipped_nor_rounded() -> None:
 
 
 @pytest.mark.parametrize("name", ["square224", "square32"])
-def test_squares_are_pillows_resizing_bit_for_bit(name: str) -> None:
+def test_square_preprocessing_equals_pillows_resizing(name: str) -> None:
     side = int(name.removeprefix("square"))
     for size in SIZES:
         expected = photo(*size).resize((side, side), Image.Resampling.BILINEAR)
@@ -155,7 +157,7 @@ def test_photo_without_a_whole_patch_is_refused(name: str, size: tuple[int, int]
     assert caught.value.code == "photo_too_small"
 
 
-def test_photo_that_keeps_its_size_may_not_be_of_any_size() -> None:
+def test_preprocessing_without_resizing_limits_the_photo_size() -> None:
     with pytest.raises(Unprocessable, match="demo1024") as caught:
         get_preprocessing("round14").apply(Image.new("RGB", (2100, 2100)))
     assert caught.value.code == "too_many_pixels"
@@ -169,7 +171,7 @@ def test_unknown_name_is_refused_with_the_known_ones() -> None:
 
 @pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("onto", [(20, 30), (41, 59), (40, 60), (97, 13), (3, 200), (1, 1)])
-def test_resampling_is_pytorchs(onto: tuple[int, int], antialias: bool) -> None:
+def test_resampling_equals_pytorchs_interpolation(onto: tuple[int, int], antialias: bool) -> None:
     pixels = np.random.default_rng(1).random((40, 60, 3), dtype=np.float32)
     modes: list[tuple[str, Kernel]] = [("bilinear", BILINEAR)]
     if not antialias:  # antialiased, PyTorch's cubic is another one (a = -0.5)

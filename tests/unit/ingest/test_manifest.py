@@ -68,7 +68,7 @@ def test_a_bad_line_is_named_with_its_number(line: bytes, why: str) -> None:
     assert why in error.detail
 
 
-def test_a_wrong_value_is_no_bad_line_but_the_photos_own_error() -> None:
+def test_an_invalid_value_in_a_manifest_fails_its_photo_only() -> None:
     [reported] = read_jsonl_manifest(
         b'{"file": "a", "latitude": 95, "longitude": 7}', "the manifest"
     )

@@ -94,7 +94,7 @@ def test_unknown_field_is_refused_and_the_known_are_named() -> None:
     assert "latitude" in error.detail
 
 
-def test_coordinates_that_are_none_are_refused() -> None:
+def test_invalid_coordinates_are_refused() -> None:
     for value in ("90.0001", "-91", "nan", "inf", "north", "45,07", "0x10"):
         assert refused_field({"latitude": value, "longitude": "0"}) == "latitude"
     for value in ("180.0001", "-181", "NaN", "-Infinity", "east"):
@@ -102,13 +102,15 @@ def test_coordinates_that_are_none_are_refused() -> None:
 
 
 @pytest.mark.parametrize(("latitude", "longitude"), [("90", "180"), ("-90", "-180"), ("0", "7")])
-def test_ends_of_the_ranges_are_places(latitude: str, longitude: str) -> None:
+def test_coordinates_at_the_ends_of_their_ranges_are_accepted(
+    latitude: str, longitude: str
+) -> None:
     found = read_form_fields({"latitude": latitude, "longitude": longitude})
     assert (found.latitude, found.longitude) == (float(latitude), float(longitude))
 
 
 @pytest.mark.parametrize("zero", ["0", "0.0", "-0.000", "0e5"])
-def test_null_island_is_no_place(zero: str) -> None:
+def test_coordinates_0_0_count_as_missing(zero: str) -> None:
     found = read_form_fields({"latitude": zero, "longitude": zero})
     assert (found.latitude, found.longitude) == (None, None)
 
@@ -139,11 +141,11 @@ def test_times_become_utc(text: str, expected: datetime) -> None:
 
 
 @pytest.mark.parametrize("text", ["yesterday", "1714559400", "0001-01-01T00:00:00+05:00"])
-def test_times_that_are_none_are_refused(text: str) -> None:
+def test_invalid_times_are_refused(text: str) -> None:
     assert refused_field({"captured_at": text}) == "captured_at"
 
 
-def test_texts_have_a_length_and_no_nul() -> None:
+def test_texts_are_limited_in_length_and_refused_with_nul() -> None:
     assert read_form_fields({"place": "x" * MAX_TEXT_CHARACTERS}).place == "x" * MAX_TEXT_CHARACTERS
     assert refused_field({"place": "x" * (MAX_TEXT_CHARACTERS + 1)}) == "place"
     assert refused_field({"tags": "a," + "x" * (MAX_TEXT_CHARACTERS + 1)}) == "tags"
@@ -151,7 +153,7 @@ def test_texts_have_a_length_and_no_nul() -> None:
     assert refused_field({"tags": "a\0b"}) == "tags"
 
 
-def test_tags_have_a_number() -> None:
+def test_the_number_of_tags_is_limited() -> None:
     many = ",".join(str(number) for number in range(MAX_TAGS))
     tags = read_form_fields({"tags": many}).tags
     assert tags is not None
@@ -182,5 +184,5 @@ def test_metadata_that_no_json_column_can_hold_is_refused(text: str) -> None:
 
 
 @pytest.mark.parametrize("text", ['{"a": "\\\\u0000"}', '{"a": "\\ud83d\\ude00"}', "{}"])
-def test_metadata_that_only_looks_strange_is_kept(text: str) -> None:
+def test_unusual_but_valid_metadata_is_kept(text: str) -> None:
     read_form_fields({"metadata": text})

@@ -18,8 +18,8 @@ HALF_EARTH_M = math.pi * RADIUS_M
 UNDECIDED_M = 0.001  # so near to a circle's edge, NumPy's and a database's sines may disagree
 
 PLACES = ["hall", "Hall", "it's", "日本"]
-TAGS = ["night", "Night", "wet", "50%", '"', "1"]
-PARTS_OF_TAGS = ["NIGH", "t", "%", '"', "0", "日"]
+TAGS = ["night", "Night", "wet", "50%", '"', "1", "[1]", "it's", "a\\b", "null", "Üben", "🏠"]
+PARTS_OF_TAGS = ["NIGH", "t", "%", '"', "0", "5_", "\\", "Üb", "üb", "日"]
 MOMENT = datetime(2024, 5, 6, 7, 8, 9, 123456, tzinfo=UTC)
 MOMENTS = [
     MOMENT + delta
@@ -125,7 +125,7 @@ def passes(photo: PhotoFilterValues, photo_filter: PhotoFilter) -> bool | None:
         photo_filter.place is None or photo.place == photo_filter.place,
         all(tag in photo.tags for tag in photo_filter.tags),
         all(
-            any(part.lower() in tag.lower() for tag in photo.tags)
+            any(part.encode().lower() in tag.encode().lower() for tag in photo.tags)
             for part in photo_filter.tags_like
         ),
         photo_filter.ids is None or photo.photo_id in photo_filter.ids,

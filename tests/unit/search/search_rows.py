@@ -61,7 +61,6 @@ def brute_force(
     query: Rows,
     k: int,
     selected: NDArray[np.bool_] | None = None,
-    min_score: float = -2.0,
     numbers: Sequence[int] | None = None,
 ) -> list[tuple[UUID, float]]:
     numbers = range(len(rows)) if numbers is None else numbers
@@ -71,7 +70,7 @@ def brute_force(
     scored = [
         (-float(np.clip(score, -1.0, 1.0)), photo(number))
         for row, (number, score) in enumerate(zip(numbers, scores.tolist(), strict=True))
-        if (selected is None or selected[row]) and score >= min_score
+        if selected is None or selected[row]
     ]
     return [(photo_id, -score) for score, photo_id in sorted(scored)[:k]]
 
@@ -123,13 +122,11 @@ class Case:
     query: Rows
     selected: NDArray[np.bool_]
     k: int
-    min_score: float | None
 
     @property
     def exact(self) -> dict[UUID, float]:
         """The scores of all rows that may be found."""
-        least = -2.0 if self.min_score is None else self.min_score
-        return dict(brute_force(self.rows, self.query, len(self.rows), self.selected, least))
+        return dict(brute_force(self.rows, self.query, len(self.rows), self.selected))
 
 
 @st.composite
@@ -151,7 +148,6 @@ def cases(draw: st.DrawFn, dimension: int) -> Case:
         query=query,
         selected=rng.random(count) < draw(st.sampled_from([1.0, 0.5, 0.02])),
         k=draw(st.sampled_from([1, 2, 10, 100, 400])),
-        min_score=draw(st.sampled_from([None, 0.1])),
     )
 
 

@@ -171,7 +171,7 @@ def loaded(stored: StoredChunk) -> LoadedChunk:
     return LoadedChunk(new_id(), "chunks/a.npy", stored.rows, photos, stored.codes, stored)
 
 
-def test_codes_lie_beside_a_long_chunk_and_beside_no_short_one(store: FolderStore) -> None:
+def test_sign_codes_are_stored_beside_long_chunks_only(store: FolderStore) -> None:
     long, short = written(store, unit_rows(MANY)), written(store, unit_rows(MANY - 2))
     assert store.head(codes_key(long.object_key)) is not None
     assert store.head(codes_key(short.object_key)) is None
@@ -181,7 +181,7 @@ def test_codes_lie_beside_a_long_chunk_and_beside_no_short_one(store: FolderStor
     delete_chunk(store, long.object_key)
 
 
-def test_codes_that_lie_beside_a_chunk_are_not_made_again(
+def test_stored_sign_codes_are_not_computed_again(
     store: FolderStore, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = unit_rows(MANY)
@@ -193,7 +193,7 @@ def test_codes_that_lie_beside_a_chunk_are_not_made_again(
         np.testing.assert_array_equal(level, expected)
 
 
-def test_codes_that_are_missing_are_made_once(
+def test_missing_sign_codes_are_computed_once(
     store: FolderStore, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = unit_rows(6)
@@ -205,7 +205,7 @@ def test_codes_that_are_missing_are_made_once(
         monkeypatch.delattr(shared.codes.serialization, "encode_signs", raising=False)
 
 
-def test_damaged_codes_beside_a_chunk_are_made_again(store: FolderStore, folder: Path) -> None:
+def test_damaged_sign_codes_are_computed_again(store: FolderStore, folder: Path) -> None:
     rows = unit_rows(MANY)
     chunk = written(store, rows)
     key = codes_key(chunk.object_key)
@@ -215,9 +215,7 @@ def test_damaged_codes_beside_a_chunk_are_made_again(store: FolderStore, folder:
     np.testing.assert_array_equal(codes.levels[-1], encode_signs(rows).levels[-1])
 
 
-def test_parts_are_held_in_memory_or_mapped_and_hold_the_same(
-    store: FolderStore, folder: Path
-) -> None:
+def test_codes_and_rows_are_equal_in_memory_and_mapped(store: FolderStore, folder: Path) -> None:
     rows = unit_rows(6)
     chunk = written(store, rows)
     loader = ChunkLoader(store, folder)
@@ -242,9 +240,7 @@ def test_parts_are_held_in_memory_or_mapped_and_hold_the_same(
     sizes=st.dictionaries(st.uuids(), st.lists(st.integers(0, 50), max_size=4), max_size=4),
     budget=st.integers(0, 300),
 )
-def test_no_more_than_the_budget_is_held_and_what_would_fit_is(
-    sizes: dict[UUID, list[int]], budget: int
-) -> None:
+def test_memory_budget_is_used_and_not_exceeded(sizes: dict[UUID, list[int]], budget: int) -> None:
     counts = allocate_parts(sizes, budget)
     left = budget - sum(sum(sizes[key][:count]) for key, count in counts.items())
     assert left >= 0
@@ -252,13 +248,13 @@ def test_no_more_than_the_budget_is_held_and_what_would_fit_is(
         assert count == len(sizes[key]) or sizes[key][count] > left
 
 
-def test_first_parts_of_all_go_before_the_second_part_of_any() -> None:
+def test_first_parts_of_all_generations_are_held_before_any_second_part() -> None:
     first, second = new_id(), new_id()
     assert allocate_parts({first: [10, 50], second: [10, 5]}, 60) == {first: 1, second: 2}
     assert allocate_parts({first: [10, 40], second: [10, 5]}, 60) == {first: 2, second: 1}
 
 
-def test_what_a_forgotten_generation_held_is_free_for_others() -> None:
+def test_unloading_a_generation_frees_its_memory_budget() -> None:
     memory = MemoryBudget(100)
     first, second = new_id(), new_id()
     assert memory.allocate(first, [60, 30]) == 2

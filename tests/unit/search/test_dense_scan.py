@@ -50,11 +50,10 @@ def scan(
     snapshot: Snapshot,
     query: Rows,
     k: int,
-    min_score: float | None = None,
     exclude: Collection[UUID] = (),
 ) -> SearchResponse:
     row_mask = build_row_mask(snapshot.photos, NO_FILTER, exclude)
-    return answer(snapshot, query, row_mask, SearchOptions(k, min_score))
+    return answer(snapshot, query, row_mask, SearchOptions(k))
 
 
 @settings(max_examples=80, deadline=None)
@@ -219,15 +218,6 @@ def test_excluded_photos_make_room_for_the_next() -> None:
     excluded = frozenset({photo(3), everything[2][0]})
     without = hits_of(scan(snapshot, rows[3], 3, exclude=excluded))
     assert without == [everything[1], everything[3], everything[4]]
-
-
-def test_min_score_is_inclusive() -> None:
-    rows = unit_rows(8, 9, 5)
-    snapshot = snapshot_of(rows, coded=False)
-    everything = hits_of(scan(snapshot, rows[0], 9))
-    bound = everything[4][1]
-    for min_score, found in ((bound, 5), (float(np.nextafter(bound, 2.0)), 4), (-1.0, 9)):
-        assert hits_of(scan(snapshot, rows[0], 9, min_score)) == everything[:found]
 
 
 def test_nothing_is_found_without_rows_or_with_a_query_of_zeros() -> None:

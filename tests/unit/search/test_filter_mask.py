@@ -30,7 +30,9 @@ def selected(
 
 @settings(max_examples=150, deadline=None)
 @given(data=some.data(), count=some.integers(1, 12))
-def test_the_mask_lets_pass_what_the_filter_means(data: some.DataObject, count: int) -> None:
+def test_filter_mask_selects_the_photos_that_match_the_filter(
+    data: some.DataObject, count: int
+) -> None:
     photos = [data.draw(photo_facts(photo_id)) for photo_id in IDS[:count]]
     photo_filter = data.draw(photo_filters(photos))
     found = selected(photos, photo_filter)
@@ -43,7 +45,7 @@ def test_the_mask_lets_pass_what_the_filter_means(data: some.DataObject, count: 
 
 @settings(max_examples=50, deadline=None)
 @given(data=some.data())
-def test_what_is_excluded_or_dead_or_asks_never_passes(data: some.DataObject) -> None:
+def test_filter_mask_leaves_out_excluded_deleted_and_query_photos(data: some.DataObject) -> None:
     photos = [data.draw(photo_facts(photo_id)) for photo_id in IDS[:6]]
     columns = PhotoColumns.of(8, enumerate(photos))  # the last two rows belong to no photo
     excluded = frozenset(data.draw(some.sets(some.sampled_from(IDS[:8]))))
@@ -73,7 +75,9 @@ def test_what_is_excluded_or_dead_or_asks_never_passes(data: some.DataObject) ->
         ),
     ],
 )
-def test_borders_of_the_globe(photo_filter: PhotoFilter, passing: str) -> None:
+def test_boxes_and_circles_cross_the_antimeridian_and_the_poles(
+    photo_filter: PhotoFilter, passing: str
+) -> None:
     names = {IDS[0]: "west", IDS[1]: "east", IDS[2]: "pole", IDS[3]: "nowhere"}
     photos = [
         facts_of(IDS[0], latitude=0, longitude=-180),
@@ -96,7 +100,7 @@ def test_bounds_of_the_time_are_inclusive_to_the_microsecond() -> None:
     assert selected(photos, PhotoFilter(captured_after=MOMENT + 9 * step)) == []
 
 
-def test_changed_columns_leave_those_before_them_alone() -> None:
+def test_updated_photo_columns_do_not_change_earlier_snapshots() -> None:
     """Queries under way go on with the snapshot that they began with."""
     before = PhotoColumns.of(2, enumerate([facts_of(IDS[0], place="hall"), facts_of(IDS[1])]))
     after = before.with_changes(

@@ -86,12 +86,12 @@ def test_sums_least_version_and_missing_chunks_are_merged() -> None:
     assert merged.missing == ("chunks/a", "chunks/b", "shard 1/4", "shard 3/4")
 
 
-def test_what_a_newer_worker_adds_to_its_answer_is_passed_over() -> None:
+def test_unknown_fields_of_a_newer_search_worker_are_ignored() -> None:
     reported = answer((1, 0.5)).model_dump(mode="json") | {"of_the_future": 1}
     assert ranked(SearchResponse.model_validate(reported)) == [(1, 0.5)]
 
 
-def test_a_generation_is_there_once_every_shard_has_it() -> None:
+def test_a_generation_is_available_once_every_shard_has_it() -> None:
     both, one = new_id(), new_id()
     lag = ReplicationLag(versions=1, seconds=2.0, answers=True)
     merged = merge_statuses(

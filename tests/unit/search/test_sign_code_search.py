@@ -45,7 +45,7 @@ def by_codes(monkeypatch: pytest.MonkeyPatch) -> None:
 @given(case=cases(DIMENSION))
 def test_answers_equal_brute_force_with_order_and_ties(case: Case) -> None:
     snapshot = snapshot_of(case.rows, case.pieces)
-    found = answer(snapshot, case.query, case.selected, SearchOptions(case.k, case.min_score))
+    found = answer(snapshot, case.query, case.selected, SearchOptions(case.k))
     assert_best(hits_of(found), case.exact, case.k)
     if case.selected.any():
         assert found.certificate == "statistical"
@@ -107,7 +107,7 @@ def test_few_rows_are_compared_without_codes(monkeypatch: pytest.MonkeyPatch) ->
     assert everything.certificate == "statistical"
 
 
-def test_codes_that_lie_are_found_out_and_every_row_is_compared() -> None:
+def test_every_row_is_compared_if_sign_codes_contradict_exact_scores() -> None:
     rows = places(6, 200)
     snapshot = snapshot_of(rows, 1)
     (chunk,) = snapshot.chunks
@@ -153,7 +153,7 @@ def test_queries_that_come_together_get_the_answers_that_they_get_alone(
     assert glances.batches_run == 2, "the first goes alone, and all others in one round after it"
 
 
-def test_after_warming_up_nothing_is_left_to_compile() -> None:
+def test_warm_up_compiles_all_kernels() -> None:
     sign_code_search.compile_kernels()
     loops = [one for one in vars(kernels).values() if hasattr(one, "signatures")]
     before = {loop.py_func.__name__: len(loop.signatures) for loop in loops}

@@ -47,7 +47,7 @@ def adversarial(kind: str, count: int, rng: np.random.Generator) -> Rows:
     ("dimension", "padded"),
     [(1, 64), (64, 64), (65, 128), (192, 192), (320, 320), (7168, 7168), (10_000, 10_240)],
 )
-def test_rotation_keeps_every_product_and_pads_little(dimension: int, padded: int) -> None:
+def test_rotation_preserves_inner_products(dimension: int, padded: int) -> None:
     rows = np.random.default_rng(dimension).standard_normal((5, dimension)).astype(np.float32)
     turn = get_rotation(dimension)
     assert turn.padded == padded
@@ -114,7 +114,7 @@ def test_estimates_err_as_the_theory_says_whatever_the_rows(kind: str) -> None:
     assert np.abs(errors / deviations).max() < 5.5
 
 
-def test_duplicates_are_estimated_no_worse() -> None:
+def test_estimates_of_duplicate_rows_have_the_stated_error() -> None:
     rng = np.random.default_rng(3)
     place = rng.standard_normal(ANYLOC)
     rows = normalised(place + 0.05 * rng.standard_normal((60, ANYLOC)))
@@ -160,7 +160,7 @@ def same(a: SignCodes, b: SignCodes) -> bool:
     )
 
 
-def test_stored_codes_are_those_that_were_made(rows: Rows) -> None:
+def test_sign_codes_survive_storage(rows: Rows) -> None:
     data = encode_sign_codes(rows, "ab" * 32)
     back = decode_sign_codes(data, rows=9, dimension=8192, chunk_sha256="ab" * 32)
     assert same(back, encode_signs(rows))

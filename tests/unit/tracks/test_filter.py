@@ -23,7 +23,7 @@ from shared.tracks.filter import (
     KIDNAPPING_RATE,
     LEAVING,
     MAX_GAIN,
-    NEWS_WEIGHT,
+    NOVELTY_WEIGHT,
     OUTSIDE_GAIN,
     SPACING_M,
     TrackFilter,
@@ -66,8 +66,8 @@ def brute_force(frames: list[FrameEvidence]) -> NDArray[np.float64]:
     for step in range(1, len(frames)):
         now, before = (np.maximum(shown[n] - 1 / COUNT, 0) for n in (step, step - 1))
         if now.sum() > 0 and before.sum() > 0:
-            news = 1 - np.sqrt(now * before).sum() / np.sqrt(now.sum() * before.sum())
-            new[step] = min(1.0, NEWS_WEIGHT * news)
+            novelty = 1 - np.sqrt(now * before).sum() / np.sqrt(now.sum() * before.sum())
+            new[step] = min(1.0, NOVELTY_WEIGHT * novelty)
     moves = []
     for step in range(len(frames)):
         move = np.zeros((COUNT + 1, COUNT + 1))

@@ -1,7 +1,7 @@
 // Add photos: a few one by one, many and those of zips in batches.
 
 import { bar, button, field, fill, h, note, noteError } from "../dom.js";
-import { takesDrops, takesPastes } from "../drop.js";
+import { fileChooser, takesDrops, takesPastes } from "../drop.js";
 import { bytes, count, plural } from "../format.js";
 import { serverSettings } from "../settings.js";
 import { localPicture } from "../photo.js";
@@ -48,16 +48,8 @@ export async function showAdd(view, { signal }) {
 }
 
 function addZone(settings, take) {
-  const chooser = (attributes) => {
-    const input = h("input", { type: "file", multiple: true, class: "hidden", tabindex: "-1", "aria-hidden": "true", ...attributes });
-    input.addEventListener("change", () => {
-      take(Array.from(input.files, (file) => ({ file, path: file.webkitRelativePath || file.name })));
-      input.value = "";
-    });
-    return input;
-  };
-  const files = chooser({ "data-use": "add", accept: "image/*,.zip" });
-  const folder = chooser({ webkitdirectory: true });
+  const files = fileChooser({ "data-use": "add", accept: "image/*,.zip" }, take);
+  const folder = fileChooser({ webkitdirectory: true }, take);
   const zone = h("section", { class: "drop", "aria-label": "Add photos" },
     h("div", { class: "drop-words" },
       h("h1", {}, "Add photos"),

@@ -2,7 +2,7 @@
 
 import { currentMap, get } from "../api.js";
 import { announce, bar, button, field, fill, h, note, noteError } from "../dom.js";
-import { takesDrops, withoutHidden } from "../drop.js";
+import { fileChooser, takesDrops, withoutHidden } from "../drop.js";
 import { count, degrees, metres, nameOf, percent, plural } from "../format.js";
 import { shrinkPhoto } from "../shrink.js";
 import { findSimilar, readHeader as headerOf } from "./ask.js";
@@ -63,16 +63,8 @@ export async function showLocate(view, { signal }) {
 }
 
 function locateZone(map, take) {
-  const chooser = (attributes) => {
-    const input = h("input", { type: "file", multiple: true, class: "hidden", tabindex: "-1", "aria-hidden": "true", ...attributes });
-    input.addEventListener("change", () => {
-      take(Array.from(input.files, (file) => ({ file, path: file.webkitRelativePath || file.name })));
-      input.value = "";
-    });
-    return input;
-  };
-  const files = chooser({ "data-use": "locate", accept: "image/*,.gpx" });
-  const folder = chooser({ webkitdirectory: true });
+  const files = fileChooser({ "data-use": "locate", accept: "image/*,.gpx" }, take);
+  const folder = fileChooser({ webkitdirectory: true }, take);
   const zone = h("section", { class: "drop", "aria-label": "Locate a folder" },
     h("div", { class: "drop-words" },
       h("h1", {}, "Locate a folder"),
@@ -152,10 +144,12 @@ async function search(photo, map, signal) {
   // Photos of the map without coordinates, such as this one, hide those that have some.
   const { similar_images: similar } = found.matches_without_place ? await find({ box: WITH_COORDINATES }) : found;
   const { estimate, pose } = found;
+  const named = estimate.has_place || estimate.levels.length > 0;
   photo.search = {
-    similar: similar.filter(({ latitude }) => latitude !== null).map((match) => ({ name: nameOf(match), latitude: match.latitude, longitude: match.longitude, score: match.similarity_score })),
+    similar: similar.filter(({ latitude }) => named && latitude !== null).map((match) => ({ name: nameOf(match), latitude: match.latitude, longitude: match.longitude, score: match.similarity_score })),
     circles: estimate.levels.filter(({ radius_m: radius }) => radius !== null).map(({ latitude, longitude, radius_m, probability }) => ({ latitude, longitude, radius_m, probability })),
-    not_in_map: estimate.not_in_map_probability ?? 0.02,
+    not_in_map: estimate.not_in_map_probability ?? estimate.elsewhere ?? 1,
+    headline: estimate.headline,
     pose: pose?.radius_68_m == null ? null : { latitude: pose.latitude, longitude: pose.longitude, radius_68_m: pose.radius_68_m, heading: pose.heading },
   };
 }

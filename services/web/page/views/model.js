@@ -38,7 +38,8 @@ export async function showModel(view, { signal }) {
           h("dt", {}, "Dimension"), h("dd", {}, map.dimension ? count(map.dimension) : "–"),
           h("dt", {}, "Photos"), h("dd", {}, `${count(map.searchable)} of ${count(map.photos)} searchable`),
           h("dt", {}, "Vocabulary"), h("dd", {}, h("span", { class: `chip ${map.vocabulary ?? ""}` }, standing)),
-          h("dt", {}, "Labels"), h("dd", {}, labelsField(map, path)))),
+          h("dt", {}, "Labels"), h("dd", {}, labelsField(map, path)),
+          h("dt", {}, "Queries from elsewhere"), h("dd", {}, elsewhereField(map, path), " %"))),
       h("div", { class: "standing-words" },
         h("p", {}, map.photos ? meaning : "This map has no photos yet: there is nothing to fit a vocabulary on."),
         map.photos ? fits && button(["own", "provisional"].includes(map.vocabulary) ? "Fit it again…" : "Fit a vocabulary…", () => fitVocabulary(follow), "primary") : h("a", { class: "button primary", href: "#/add" }, "Add photos"),
@@ -65,6 +66,13 @@ function labelsField(map, path) {
   const input = h("select", { "aria-label": "Labels" }, Object.entries(LABELS).map(([value, words]) => h("option", { value }, value === "auto" && map.place_labels_are_automatic ? `${words} (${map.place_labels_are_paths ? "paths" : "names"})` : words)));
   input.value = map.place_labels_are_automatic ? "auto" : String(map.place_labels_are_paths);
   input.addEventListener("change", () => ask(path, { method: "PATCH", json: { place_labels_are_paths: JSON.parse(input.value === "auto" ? '"auto"' : input.value) } }).then(() => note("Saved."), noteError));
+  return input;
+}
+
+/** The share of the map's queries that are from elsewhere, in percent. */
+function elsewhereField(map, path) {
+  const input = h("input", { type: "number", "aria-label": "Queries from elsewhere", min: 1, max: 99, required: true, value: Math.round(100 * map.elsewhere) });
+  input.addEventListener("change", () => input.reportValidity() && ask(path, { method: "PATCH", json: { elsewhere: input.valueAsNumber / 100 } }).then(() => note("Saved."), noteError));
   return input;
 }
 

@@ -11,11 +11,12 @@ const LOOK_SECONDS = 5;
 
 export async function showStatus(view, { signal }) {
   const drawn = { health: h("section", { class: "card" }), figures: h("section", { class: "card" }), jobs: h("section", { class: "card" }), searches: h("section", { class: "card" }) };
+  const settings = await serverSettings();
   const look = async () => {
     const [health, stats, map, { jobs }, { searches }] = await Promise.all([
       // 503 with the same answer, where a part does not respond.
       get("/health", { signal, also: [503] }), get("/database/stats", { signal }), get(`/maps/${encodeURIComponent(currentMap())}`, { signal }),
-      get("/jobs", { query: { limit: 12, kind: KINDS }, signal }), get("/searches", { query: { limit: 12 }, signal }),
+      get("/jobs", { query: { limit: 12, kind: settings.job_kinds }, signal }), get("/searches", { query: { limit: 12 }, signal }),
     ]);
     drawHealth(drawn.health, health);
     const failed = stats.failed_images ? (await get("/search", { query: { failed: true, limit: 12 }, signal })).images : [];
@@ -24,7 +25,7 @@ export async function showStatus(view, { signal }) {
     drawSearches(drawn.searches, searches);
   };
   await look();
-  fill(view, h("header", { class: "head" }, h("h1", {}, "Status"), h("p", { class: "row" }, h("a", { class: "button", href: "/docs" }, "The API"))), h("div", { class: "status-grid" }, Object.values(drawn), phoneCard(await serverSettings())));
+  fill(view, h("header", { class: "head" }, h("h1", {}, "Status"), h("p", { class: "row" }, h("a", { class: "button", href: "/docs" }, "The API"))), h("div", { class: "status-grid" }, Object.values(drawn), phoneCard(settings)));
   const timer = setInterval(() => {
     // Not while someone is at a button of what would be drawn anew.
     if (!document.hidden && ![drawn.jobs, drawn.figures].some((card) => card.contains(document.activeElement))) look().catch((error) => !signal.aborted && drawUnreachable(drawn.health, error));
@@ -67,9 +68,6 @@ function drawFigures(card, stats, map, failed, look) {
     h("p", {}, measurementInWords(map, look)),
     failed.length > 0 && h("p", {}, "Photos that could not be described, and are not found: ", failed.flatMap((photo, index) => [index > 0 && ", ", h("a", { href: `#/photo/${photo.image_id}` }, photo.original_filename)]), stats.failed_images > failed.length && ` and ${count(stats.failed_images - failed.length)} more`, "."));
 }
-
-// Those that a search starts are listed as questions.
-const KINDS = ["index", "batch", "fit", "import_vocabulary", "switch", "pca", "add_model", "reconstruct", "evaluate"];
 
 function drawJobs(card, jobs, look) {
   if (!jobs.length) {

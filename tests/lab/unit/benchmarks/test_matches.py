@@ -44,10 +44,10 @@ def features() -> list[LocalFeatures]:
 
 
 def test_matches_find_the_places_that_descriptors_confuse_at_a_cost_that_is_reported() -> None:
-    matched = MatchedPhotos(features(), MutualNearest.of_model(MODEL))
+    matched = MatchedPhotos(features().__getitem__, MutualNearest.of_model(MODEL))
     report = Report("matches")
     compare(report, described(), matched)
-    add_cost(report, "house", matched, seconds=0.64)
+    add_cost(report, "house", features(), matched, seconds=0.64)
     measured = {figure.what: figure.measured for figure in report.figures}
     recalls = [
         measured[f"house, {name} matches: right at the finest level"]
@@ -60,7 +60,7 @@ def test_matches_find_the_places_that_descriptors_confuse_at_a_cost_that_is_repo
 
 
 def test_each_pair_is_matched_once() -> None:
-    matched = MatchedPhotos(features()[:5], MutualNearest.of_model(MODEL))
+    matched = MatchedPhotos(features().__getitem__, MutualNearest.of_model(MODEL))
     same, other = matched.match(1, [0, 4])
     assert same is not None
     assert other is not None

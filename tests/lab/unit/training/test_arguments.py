@@ -64,7 +64,7 @@ PREDECESSORS: dict[str, Any] = {
     "save_weights_only": True,
     "save_top_k": 3,
     "mode": "max",
-    "accelerator": "gpu",
+    "accelerator": "auto",
     "devices": (0,),
     "default_root_dir": "./LOGS/",
     "num_sanity_val_steps": 0,
@@ -125,7 +125,7 @@ def test_the_published_command_ends_where_there_is_no_gpu_with_an_error_that_say
     assert answer.exit_code == 1
     shown = answer.output.replace("\n", " ")
     assert "no_gpu" in shown
-    assert "--accelerator cpu" in shown
+    assert "--accelerator auto" in shown
     assert "data_root_missing" in shown, "every obstacle is listed at once"
 
 

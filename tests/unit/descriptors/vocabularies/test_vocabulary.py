@@ -76,7 +76,7 @@ def with_row(index: int, row: Any, dtype: str = "float32") -> NDArray[Any]:
         *((good_centres().astype(dtype), "not floating point") for dtype in ("i8", "c8", "S4")),
     ],
 )
-def test_arrays_that_would_spoil_descriptors_are_refused(array: NDArray[Any], reason: str) -> None:
+def test_centres_with_invalid_values_are_refused(array: NDArray[Any], reason: str) -> None:
     assert reason in refusal(array, width=6)
 
 

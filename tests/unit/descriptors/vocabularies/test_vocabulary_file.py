@@ -150,7 +150,7 @@ def broken_tensor_files() -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", broken_tensor_files())
-def test_broken_tensor_files_are_refused_and_run_nothing(name: str, tmp_path: Path) -> None:
+def test_damaged_tensor_files_are_refused_without_executing_code(name: str, tmp_path: Path) -> None:
     path = tmp_path / "c_centers.pt"
     path.write_bytes(broken_tensor_files()[name])
     with pytest.raises(Unprocessable) as caught:

@@ -200,7 +200,7 @@ def attention(w: Weights, name: str, queries: Array, keys: Array) -> Array:
     return linear(w, f"{name}.out_proj", np.concatenate(heads, axis=1))
 
 
-def test_boq_asks_each_blocks_positions_with_learnt_queries() -> None:
+def test_boq_attends_to_each_blocks_features_with_learned_queries() -> None:
     def formula(photo: Array, w: Weights) -> Array:
         padded = np.pad(photo, ((0, 0), (1, 1), (1, 1)))
         windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(1, 2))

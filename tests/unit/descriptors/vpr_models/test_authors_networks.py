@@ -185,7 +185,7 @@ def test_megaloc_describes_as_its_authors_network(suffix: str, tmp_path: Path) -
         ("net.", "weights"),
     ],
 )
-def test_what_training_code_puts_before_the_names_of_tensors_is_left_out(
+def test_prefixes_of_tensor_names_are_removed(
     before: str, entry: str | None, tmp_path: Path
 ) -> None:
     _, tensors = cosplace("efficientnet_b0")

@@ -101,7 +101,7 @@ def test_without_arguments_an_aggregator_has_the_published_size(
     assert model(torch.empty(2, 3, 320, 320, device="meta")).shape == (2, dimension)
 
 
-def test_names_are_taken_as_the_predecessor_took_them() -> None:
+def test_backbone_and_aggregator_names_match_as_in_the_predecessor() -> None:
     assert config(backbone_arch="ResNeXt50").backbone_arch == "resnext50_32x4d"
     assert config(backbone_arch="dinov2-b").backbone_arch == "dinov2_vitb14"
     for written, meant in (("gempool", "GeM"), ("COSPLACE", "CosPlace"), ("my_mixvpr", "MixVPR")):
@@ -116,7 +116,7 @@ def test_an_aggregator_whose_name_contains_that_of_another_can_be_selected(
     assert config(agg_arch="GeM").agg_arch == "GeM"
 
 
-def test_the_models_own_configuration_is_complete_and_the_given_one_stays() -> None:
+def test_configuration_of_a_model_is_completed_without_changing_the_argument() -> None:
     given = config(agg_arch="mixvpr", agg_config={"out_rows": 2})
     model = laid_out(agg_arch="mixvpr", agg_config={"out_rows": 2})
     assert given.agg_config == {"out_rows": 2}
@@ -154,7 +154,7 @@ def test_the_models_own_configuration_is_complete_and_the_given_one_stays() -> N
         ({"backbone_arch": "dinov2_vits14"}, "image_size_unsupported", "70 x 98"),
     ],
 )
-def test_what_can_not_be_built_is_refused_with_the_reason(
+def test_invalid_network_configurations_are_refused_with_the_reason(
     changes: dict[str, Any], code: str, message: str
 ) -> None:
     with pytest.raises(Unprocessable, match=message) as refused:
@@ -295,7 +295,7 @@ def test_pretrained_weights_come_from_the_cache_or_from_a_file(no_network: Path)
     assert torch.equal(cached.state_dict()["backbone.stages.1.1.conv2.weight"], expected)
 
 
-def test_weights_that_can_not_be_had_are_missing_and_never_random(no_network: Path) -> None:
+def test_missing_pretrained_weights_raise_an_error(no_network: Path) -> None:
     for name, weights in (("resnet18", None), ("resnet18", no_network / "none.pth"),
                           ("efficientnet_lite0", no_network / "none.pth")):  # fmt: skip
         with pytest.raises(Misconfigured) as refused:

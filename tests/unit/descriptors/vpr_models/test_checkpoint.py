@@ -65,9 +65,7 @@ def test_a_checkpoint_brings_back_the_model_and_where_it_comes_from(
     assert not any(parameter.requires_grad for parameter in found.model.parameters())
 
 
-def test_what_lightning_keeps_beside_the_model_is_no_hindrance(
-    model: VprModel, tmp_path: Path
-) -> None:
+def test_lightning_state_beside_the_weights_is_ignored(model: VprModel, tmp_path: Path) -> None:
     state = checkpoint_state(model) | {
         "epoch": 7,
         "global_step": 4382,
@@ -112,7 +110,9 @@ def test_a_checkpoint_that_would_execute_something_is_refused(
     assert target.exists()
 
 
-def test_what_is_no_checkpoint_is_refused_and_a_missing_one_is_not_found(tmp_path: Path) -> None:
+def test_files_that_are_no_checkpoint_are_refused_and_missing_ones_are_not_found(
+    tmp_path: Path,
+) -> None:
     file = tmp_path / "damaged.ckpt"
     for damage in (b"", b"not a checkpoint", b"PK\x03\x04 torn"):
         file.write_bytes(damage)
@@ -197,7 +197,7 @@ def repeated_views(path: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["storage", "pickle", "overlapping", "repeated views"])
-def test_a_hostile_checkpoint_is_refused_before_it_swells(
+def test_a_checkpoint_that_expands_in_memory_is_refused_before_it_is_read(
     model: VprModel, tmp_path: Path, kind: str
 ) -> None:
     buffer = io.BytesIO()

@@ -1,41 +1,35 @@
-"""Response models of the API, and helpers that build URLs and 202 responses.
-
-Times are UTC with an offset, ids are UUIDv7, sizes are bytes.
-"""
+"""Responses about photos, and to similarity searches: matches, estimates and poses."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
 from datetime import datetime
-from typing import Any, Self
-from urllib.parse import urlencode
+from typing import Annotated, Any
 from uuid import UUID
 
-from fastapi.responses import JSONResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
 
-from services.gateway.dependencies import API_PREFIX
-from shared.catalog.generations import GenerationState, RowType
-from shared.catalog.maps import DEFAULT_MAP
-from shared.catalog.photos import Photo, PhotoRole
-from shared.catalog.vocabularies import VocabularyOrigin
-from shared.jobs import Job, JobKind, JobState
-from shared.search_api.protocol import PointPair, SeenPoint
+from shared.enums import PhotoRole, RowType
+from shared.responses import OPEN, ResponseModel
 
 
-class ResponseModel(BaseModel):
-    model_config = ConfigDict(frozen=True, from_attributes=True, populate_by_name=True)
+class PointPair(ResponseModel):
+    """Two points that show the same spot, in pixels of the upright photos."""
 
-    @classmethod
-    def of_row(cls, row: object, **values: Any) -> Self:
-        """Build the response from `values` and, for the other required fields, from a row.
+    model_config = ConfigDict(extra="ignore")  # of a newer search worker, too
 
-        The row's attributes are named as the fields, or as their `validation_alias`.
-        """
-        for name, field in cls.model_fields.items():
-            if name not in values and field.is_required():
-                values[name] = getattr(row, str(field.validation_alias or name))
-        return cls(**values)
+    query: tuple[float, float]
+    photo: tuple[float, float]
+
+
+class SeenPoint(ResponseModel):
+    """A point of a reconstruction that a query shows."""
+
+    model_config = ConfigDict(extra="ignore")  # of a newer search worker, too
+
+    query: tuple[float, float]
+    """in pixels of the upright query"""
+    point: tuple[float, float, float]
+    """in the component's frame"""
 
 
 class PhotoResponse(ResponseModel):
@@ -62,26 +56,10 @@ class PhotoResponse(ResponseModel):
     )
     captured_at: datetime | None
     place: str | None
-    role: PhotoRole
+    role: Annotated[PhotoRole, OPEN]
     image_url: str
     thumbnail_url: str
     preview_url: str
-
-    @classmethod
-    def of(cls, photo: Photo, map_name: str, **values: Any) -> Self:
-        """Build the response; `values` are the fields that subclasses add."""
-        image, thumbnail, preview = (
-            url_in_map(f"/uploads/{photo.id}/{name}", map_name)
-            for name in ("image", "thumbnail", "preview")
-        )
-        return cls.of_row(
-            photo,
-            image_path=image,
-            image_url=image,
-            thumbnail_url=thumbnail,
-            preview_url=preview,
-            **values,
-        )
 
 
 class PhotoDetailResponse(PhotoResponse):
@@ -281,7 +259,7 @@ class SimilarityResponse(ResponseModel):
         "map has a vocabulary; `none`: the extractor uses none"
     )
     generation_id: UUID
-    rows: RowType = Field(
+    rows: Annotated[RowType, OPEN] = Field(
         description="type of the stored descriptors, for which scores are exact: `float32` or "
         "`float16`"
     )
@@ -305,201 +283,3 @@ class SimilarityResponse(ResponseModel):
         description="what could not be searched: unreadable chunks (`chunks/....npy`) and shards "
         "without a search worker (`shard 1/3`)"
     )
-
-    def with_photos(self, photos: Iterable[SimilarPhotoResponse]) -> SimilarityResponse:
-        """Return a copy of the response with these photos."""
-        images = list(photos)
-        without_place = sum(image.latitude is None and image.place is None for image in images)
-        return self.model_copy(
-            update={
-                "similar_images": images,
-                "total_similar": len(images),
-                "matches_without_place": without_place,
-            }
-        )
-
-
-class MetadataSearchResponse(ResponseModel):
-    total_found: int = Field(
-        description="number of all matches, not only of this page; at most 10,000"
-    )
-    total_is_exact: bool = Field(description="false: there may be more than `total_found`")
-    images: list[PhotoResponse]
-    next_cursor: str | None
-    query_time_ms: float
-
-
-class JobProgress(ResponseModel):
-    done: int = Field(validation_alias="progress_done")
-    total: int = Field(validation_alias="progress_total")
-    failed: int = Field(validation_alias="progress_failed")
-
-
-JOB_LABELS = {
-    JobKind.INDEX: "Photo",
-    JobKind.REINDEX: "Photo for a new model",
-    JobKind.DESCRIBE: "Query photo",
-    JobKind.FIT: "Improving the map",
-    JobKind.IMPORT: "Vocabulary import",
-    JobKind.SWITCH: "Switch",
-    JobKind.PCA: "PCA",
-    JobKind.ADD_MODEL: "New model",
-    JobKind.RECONSTRUCT: "Reconstruction",
-    JobKind.EVALUATE: "Evaluation",
-    JobKind.BATCH: "Batch",
-}
-
-
-class JobResponse(ResponseModel):
-    job_id: UUID = Field(validation_alias="id")
-    kind: JobKind
-    label: str = Field(description="the kind in plain words, such as `Improving the map`")
-    state: JobState
-    stage: str | None = Field(
-        description="model changes: `sample`, `cluster`, `describe`, `load`; batches: `list`, "
-        "`store`, `describe`"
-    )
-    waiting_for: str | None = Field(
-        description="what must become available before the job can continue: `vocabulary`, "
-        "`descriptors`, `search`, or for batches `disk_space`"
-    )
-    awaited: list[str] | None = Field(
-        description="search workers that the job has been waiting for longer than a minute"
-    )
-    progress: JobProgress
-    attempts: int
-    map: str
-    file_id: UUID | None = Field(validation_alias="photo_id")
-    filename: str | None = Field(
-        description="name of the photo, or of the uploaded vocabulary or checkpoint"
-    )
-    result: dict[str, Any] | None
-    error: dict[str, Any] | None = Field(description="an RFC 9457 problem")
-    created_at: datetime
-    started_at: datetime | None
-    finished_at: datetime | None
-    status_url: str
-    result_url: str | None
-    request_id: str | None = Field(
-        description="`X-Request-ID` of the request that created the job, as in the logs"
-    )
-
-    @classmethod
-    def of(cls, job: Job, map_name: str, filename: str | None) -> JobResponse:
-        """Build the response; `filename` is that of its photo or uploaded file, if it has one."""
-        is_query = job.kind == JobKind.DESCRIBE
-        return cls.of_row(
-            job,
-            label=JOB_LABELS[JobKind(job.kind)],
-            progress=JobProgress.model_validate(job),
-            map=map_name,
-            filename=filename,
-            result=None if is_query else job.result,
-            status_url=job_url(job.id, map_name),
-            result_url=job_url(job.id, map_name, "/result") if is_query else None,
-        )
-
-
-class JobsResponse(ResponseModel):
-    jobs: list[JobResponse]
-    next_cursor: str | None
-
-
-class JobAcceptedResponse(ResponseModel):
-    """202: the job is queued; poll `status_url`."""
-
-    job_id: UUID
-    status: JobState
-    status_url: str
-    result_url: str | None = None
-
-    @classmethod
-    def of(cls, job: Job, map_name: str, **values: Any) -> Self:
-        """Build the response; `values` are the fields that subclasses add."""
-        result_url = job_url(job.id, map_name, "/result") if job.kind == JobKind.DESCRIBE else None
-        return cls(
-            job_id=job.id,
-            status=JobState(job.state),
-            status_url=job_url(job.id, map_name),
-            result_url=result_url,
-            **values,
-        )
-
-    @property
-    def headers(self) -> dict[str, str]:
-        """Headers of the response."""
-        return accepted_headers(self.status_url)
-
-    def to_http(self, headers: Mapping[str, str] | None = None) -> JSONResponse:
-        """Return the HTTP response, for routes whose response model is that of another status."""
-        return JSONResponse(self.model_dump(mode="json"), 202, {**(headers or {}), **self.headers})
-
-
-class UploadResponse(ResponseModel):
-    file_id: UUID
-    job_id: UUID | None
-    filename: str
-    file_size: int
-    upload_time: datetime
-    status: JobState
-    status_url: str
-    already_there: bool = Field(description="the map already has this picture; no photo was added")
-    updated: list[str] = Field(
-        description="values of the map's photo that new metadata of its file has set"
-    )
-    message: str
-
-
-class DeletedPhotoResponse(ResponseModel):
-    success: bool
-    message: str
-    deleted_file_id: UUID
-
-
-class VocabularyResponse(ResponseModel):
-    vocabulary_id: UUID = Field(validation_alias="id")
-    origin: VocabularyOrigin
-    clusters: int
-    dimension: int
-    sha256: str
-    provenance: dict[str, Any] = Field(
-        description="features that it was fitted on: `backbone`, `backbone_fingerprint`, `layer`, "
-        "`facet`, `preprocessing`, and for a fit `photos`, `seed` and more; `learnt_with: unknown` "
-        "if the imported file does not contain them"
-    )
-    created_at: datetime
-
-
-class GenerationResponse(ResponseModel):
-    generation_id: UUID = Field(validation_alias="id")
-    state: GenerationState
-    extractor: str
-    dimension: int = Field(description="of its descriptors, after PCA if there is one")
-    pca_from: int | None = Field(description="dimension before PCA; null without PCA")
-    rows: RowType = Field(
-        validation_alias="row_type",
-        description="type of its stored descriptors: `float32` or `float16`",
-    )
-    vocabulary_id: UUID | None
-    photos: int = Field(description="live photos with a descriptor in this generation")
-    spec: dict[str, Any]
-    created_at: datetime
-    activated_at: datetime | None
-    ended_at: datetime | None
-
-
-def url_in_map(path: str, map_name: str) -> str:
-    """Return the URL path of an endpoint, with `?map=` unless the map is the default one."""
-    return f"{API_PREFIX}{path}" + (
-        "" if map_name == DEFAULT_MAP else f"?{urlencode({'map': map_name})}"
-    )
-
-
-def job_url(job_id: UUID, map_name: str, suffix: str = "") -> str:
-    """Return the URL path of a job, or of one of its subresources such as `/result`."""
-    return url_in_map(f"/jobs/{job_id}{suffix}", map_name)
-
-
-def accepted_headers(status_url: str) -> dict[str, str]:
-    """Build the headers of a 202 response."""
-    return {"Location": status_url, "Retry-After": "1"}

@@ -53,7 +53,7 @@ FIT = {"clusters": 8, "sample": 100, "seed": 0}
 
 
 @dataclass(slots=True)
-class Workplace:
+class Harness:
     catalog: Catalog
     store: FolderStore
     settings: Settings

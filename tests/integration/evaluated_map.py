@@ -41,7 +41,7 @@ Seen = tuple[float, dict[str, Any]]
 """A photo: its angle in degrees, and what is known of it (columns of `Photo`)."""
 
 
-class Town:
+class EvaluatedMap:
     """Photos at angles, published as an extractor does it, and an evaluator to ask them."""
 
     def __init__(self, catalog: Catalog, store: FolderStore, name: str = DEFAULT_MAP) -> None:

@@ -95,7 +95,7 @@ SETTLED_SECONDS = 2.0  # that a message may take from the commit to Redis before
 WARNING_INTERVAL_SECONDS = 60.0  # between two log lines about an unreachable Redis
 
 
-class CeleryWakeups:
+class CeleryJobMessages:
     """Sends messages about jobs from a thread, which `close` ends.
 
     `worker` is the name of the Celery worker that this process is, in whose name it sends events.

@@ -1,4 +1,4 @@
-"""A generated town in a map: photos of two seasons, labelled queries of others."""
+"""A generated city in a map: photos of two seasons, labelled queries of others."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ QUERIES = 16
 SEASON = re.compile(r"-([a-z]+)-")
 
 
-def build_town(server: ServerProcess, folder: Path, map_name: str) -> list[Path]:
+def build_city(server: ServerProcess, folder: Path, map_name: str) -> list[Path]:
     """Draw it below `folder`, bring it in and measure it; the photos to ask with."""
     options = CityOptions(
         places=PLACES,
