@@ -144,9 +144,8 @@ def fit_log_odds(maps: Iterable[Mapping[str, FloatArray]]) -> Coefficients:
         for name, features in each.items()
     ]
     width = rows[0][1].shape[1]
-    used, slopes = np.zeros(width), np.ones(width)
+    used, slopes = np.ones(width, dtype=bool), np.ones(width)
     while (slopes > 0).any():
-        used = np.where(slopes > 0, 1 - used, used)
         table = RegressionTable.of_rows(
             (row * used, is_elsewhere, MAP_WEIGHT * share / len(features))
             for is_elsewhere, features, share in rows
@@ -155,6 +154,7 @@ def fit_log_odds(maps: Iterable[Mapping[str, FloatArray]]) -> Coefficients:
         plain = PlacePrior(means=(0.0,) * width, scales=(1.0,) * width, level=(), missing_place=())
         intercept, *fitted = fit_map_estimate(table, (0.0,) * (1 + width), plain, 0.01)
         slopes = np.array(fitted)
+        used &= slopes <= 0
     # As in conformal prediction, one more photo, which passes, is counted.
     least = min(
         np.sort(intercept + features @ slopes)[max(0, (len(features) + 1) // 20 - 1)]
