@@ -37,6 +37,7 @@ import typer
 from numpy.typing import NDArray
 from PIL import Image
 from rich.progress import Progress
+from scipy.stats import binomtest
 
 from lab.benchmarks.matches import detect_all
 from lab.benchmarks.pose_peer import PeerModel, cpu_seconds
@@ -46,7 +47,7 @@ from lab.city.round_trip import plan_round_trip
 from lab.city.sessions import AUTUMN, NIGHT, SPRING, WINTER
 from lab.city.write import write_city
 from services.cli.output import JsonOption, Table
-from services.extractor.geometry.calibrate import calibrate, localise_left_out
+from services.extractor.geometry.calibrate import ComponentPhotos, calibrate, localise_left_out
 from services.extractor.geometry.evidence import fit_to_positions
 from services.extractor.geometry.mapping import PhotoToMap, map_photos, require_pycolmap
 from services.extractor.geometry.matching import match_pairs
@@ -163,16 +164,15 @@ class MappedPhotos:
         """See `localise_left_out`."""
         photos = self.components[component].photo_ids
         rows = [self.ids.index(photo) for photo in photos]
-        return localise_left_out(
+        left_out = ComponentPhotos(
             self.components[component],
             self.features,
             self.vlad.rows[rows],
             self.seconds[rows],
             [None] * len(rows),
-            self.matcher,
             alignment.similarity if alignment else None,
-            lambda _: None,
         )
+        return localise_left_out(left_out, self.matcher, lambda _: None)
 
 
 def bench(
@@ -226,10 +226,9 @@ def measure_synthetic(report: Report) -> None:
                 error = found.position - image.projection_center()
                 square = float(error @ np.linalg.solve(found.covariance[:3, :3], error))
             squares.append(square)
-    within_68, within_95, within_3 = (100 * np.mean(np.array(squares) < q) for q in CHI_SQUARED)
-    report.add("synthetic scenes: poses", len(squares))
-    report.add("synthetic scenes: within 3 deviations", float(within_3), "%", at_least=99)
-    _add_coverage(report, "synthetic scenes", float(within_68), float(within_95))
+    within_3 = 100 * float(np.mean(np.array(squares) < CHI_SQUARED[2]))
+    report.add("synthetic scenes: within 3 deviations", within_3, "%", at_least=99)
+    _add_coverage(report, "synthetic scenes", np.array(squares), *CHI_SQUARED[:2])
 
 
 def measure_streets(report: Report, count: int, progress: Progress) -> list[tuple[str, int, int]]:
@@ -270,11 +269,13 @@ def measure_streets(report: Report, count: int, progress: Progress) -> list[tupl
         posed = [
             p.position if isinstance(p, LocalPose) and not p.component else None for p in outcomes
         ]
-        judged = [
-            _judge(pose, alignment, calibration, place)
-            for pose, place in zip(outcomes, true_queries, strict=True)
-            if isinstance(pose, LocalPose) and not pose.component
-        ]
+        judged = np.array(
+            [
+                _judge(pose, alignment, calibration, place, query.camera.yaw)
+                for pose, place, query in zip(outcomes, true_queries, queries, strict=True)
+                if isinstance(pose, LocalPose) and not pose.component
+            ]
+        )
         rows = [mapped.ids.index(photo) for photo in component.photo_ids]
         turns = [component.rotation(row) for row in range(len(rows))]
         ours = (rows, component.centres(), turns, posed, mapped.cpu_seconds)
@@ -299,9 +300,9 @@ def measure_streets(report: Report, count: int, progress: Progress) -> list[tupl
             )
             if what == str(seed):
                 report.add(f"street {seed}: photos at a wrong place", far, at_most=0)
-        errors, *radii = np.array([each[:3] for each in judged]).T
-        _add_coverage(report, f"street {seed}", *(100 * float(np.mean(errors <= r)) for r in radii))
-        wrong += int(np.sum(errors > WRONG_RADII * radii[1]))
+        _add_coverage(report, f"street {seed}", *judged.T[:3])
+        _add_coverage(report, f"street {seed}, heading", *judged.T[3:])
+        wrong += int(np.sum(judged[:, 0] > WRONG_RADII * judged[:, 2]))
         tried += len(judged)
     report.tables.append(table)
     return [("photos of streets", wrong, tried)]
@@ -331,15 +332,10 @@ def measure_city(report: Report, count: int, progress: Progress) -> list[tuple[s
     mapped = MappedPhotos([features[n] for n in members], detector.model, seconds, truth[members])
     report.add("city: photos", len(members))
     report.add("city: photos in the largest component", len(mapped.components[0].photo_ids))
-    report.add("city: matched and reconstructed", mapped.seconds_taken, "s")
     per_100 = 100 * mapped.seconds_taken / len(members)
     report.add("city: reconstructed, for each 100 photos", per_100, "s", at_most=300)
     alignment = _align(mapped, truth[members])
-    started = time.perf_counter()
     calibration = mapped.calibrate(0, alignment)
-    report.add("city: calibrated", time.perf_counter() - started, "s")
-    report.add("city: quantile factor of 68 %", calibration.position_68)
-    report.add("city: quantile factor of 95 %", calibration.position_95)
     query_numbers = [n for n, photo in enumerate(plan.photos) if photo.role == "query"]
     localised = {n: mapped.localise(features[n]) for n in query_numbers}
     report.add_latency("city: a pose", mapped.pose_seconds, p95_at_most_ms=1500)
@@ -355,16 +351,13 @@ def measure_city(report: Report, count: int, progress: Progress) -> list[tuple[s
     ):
         numbers = [n for n, p in enumerate(plan.photos) if _is_query_of(p, *names)]
         found = [n for n in numbers if isinstance(localised[n], LocalPose)]
-        judged = [_judge(localised[n], alignment, calibration, truth[n]) for n in found]
-        errors = np.array([each[0] for each in judged])
-        headings = np.array(
-            [
-                abs((each[3] - plan.photos[n].camera.yaw + 180) % 360 - 180)
-                for n, each in zip(found, judged, strict=True)
-            ]
+        yaws = {n: plan.photos[n].camera.yaw for n in found}
+        judged = np.array(
+            [_judge(localised[n], alignment, calibration, truth[n], yaws[n]) for n in found]
         )
-        in_68, in_95 = (100 * float(np.mean(errors <= [e[i] for e in judged])) for i in (1, 2))
-        radius = float(np.median([each[1] for each in judged]))
+        errors, headings = judged[:, 0], judged[:, 3]
+        in_68, in_95 = (100 * float(np.mean(errors <= judged[:, i])) for i in (1, 2))
+        radius = float(np.median(judged[:, 1]))
         share = 100 * len(found) / len(numbers)
         values = (share, np.median(errors), np.median(headings), in_68, in_95, radius)
         table.add_row(what, *(f"{value:.2f}" for value in values))
@@ -374,18 +367,20 @@ def measure_city(report: Report, count: int, progress: Progress) -> list[tuple[s
         limit = report.add
         limit(f"city, {what}: median error", float(values[1]), "m", at_most=0.5 if day else None)
         limit(f"city, {what}: median heading", float(values[2]), "°", at_most=2 if day else None)
-        _add_coverage(report, f"city, {what}", in_68, in_95)
-        covered = np.array(
-            [[_judge(localised[n], off, calibration, truth[n])[:3] for n in found] for off in noisy]
-        )
+        _add_coverage(report, f"city, {what}", *judged.T[:3])
+        _add_coverage(report, f"city, {what}, heading", *judged.T[3:])
         if day:
-            in_68, in_95 = (
-                100 * float(np.mean(covered[..., 0] <= covered[..., i])) for i in (1, 2)
+            covered = np.array(
+                [
+                    _judge(localised[n], off, calibration, truth[n], yaws[n])
+                    for n in found
+                    for off in noisy
+                ]
             )
             what = f"city, {what}, coordinates {COORDINATE_NOISE_M:.0f} m off"
-            report.add(f"{what}: median error", float(np.median(covered[..., 0])), "m")
-            _add_coverage(report, what, in_68, in_95)
-        wrong += sum(error > WRONG_RADII * r95 for error, _, r95, _ in judged)
+            report.add(f"{what}: median error", float(np.median(covered[:, 0])), "m")
+            _add_coverage(report, what, *covered.T[:3])
+        wrong += int(np.sum(errors > WRONG_RADII * judged[:, 2]))
         tried += len(found)
     report.tables.append(table)
     report.add("city: wrong poses of all", 100 * wrong / max(1, tried), "%", at_most=1)
@@ -396,21 +391,17 @@ def measure_city(report: Report, count: int, progress: Progress) -> list[tuple[s
     for what, changed in (("mirrored", mirrored), ("noise", noise), ("panoramas", panoramas)):
         rows.append((what, _accepted(map(mapped.localise, changed)), len(changed)))
     for factor in (0.6, 1.6):
-        judged = []
+        bad = 0
         for n in by_day[:other]:
             focal_length = factor * plan.photos[n].camera.focal / 640
             pose = mapped.localise(features[n], focal_length)
-            if isinstance(pose, LocalPose):
-                judged.append(_judge(pose, alignment, calibration, truth[n]))
-        bad = sum(error > WRONG_RADII * r95 for error, _, r95, _ in judged)
+            bad += _is_wrong(pose, alignment, calibration, truth[n])
         rows.append((f"{factor} times the focal length", bad, other))
     bad = 0
     for n in by_day[:other]:
         foreign = features[int(rng.choice(outside))]
         pose = mapped.localise(_covered(features[n], foreign))
-        if isinstance(pose, LocalPose):
-            error, _, r95, _ = _judge(pose, alignment, calibration, truth[n])
-            bad += error > WRONG_RADII * r95
+        bad += _is_wrong(pose, alignment, calibration, truth[n])
     rows.append(("two fifths show what is not in the map", bad, other))
     return rows
 
@@ -427,17 +418,8 @@ def measure_floors(
     advance = partial(progress.advance, bar)
     features = dict(zip(paths, detect_all(detector, paths, advance)[0], strict=True))
     of_queries = dict(zip(queries, detect_all(detector, queries, advance)[0], strict=True))
-    table = Table(
-        "floor",
-        "photos",
-        "in the model",
-        "components",
-        "s",
-        "poses %",
-        "left out %",
-        "error, % of the path",
-        title="floors",
-    )
+    columns = ("floor", "photos", "in the model", "components", "s", "poses %", "left out %")
+    table = Table(*columns, "error, % of the path", title="floors")
     found = tried = others = others_tried = 0
     errors: list[float] = []
     for name in names:
@@ -477,14 +459,25 @@ def measure_floors(
 
 
 def _judge(
-    pose: Outcome, alignment: Alignment, calibration: PoseCalibration, truth: Floats
-) -> tuple[float, float, float, float]:
-    """Return the horizontal error and the radii of 68 and 95 % in metres, and the heading."""
+    pose: Outcome, alignment: Alignment, calibration: PoseCalibration, truth: Floats, yaw: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return horizontal error and radii of 68 and 95 % in metres; of the heading, in degrees."""
     assert isinstance(pose, LocalPose)
     found = geo_pose(pose, alignment.origin, alignment.similarity, calibration)
     position = PLANE.from_geographic([found.latitude], [found.longitude], [truth[2]])[0]
     error = float(np.linalg.norm((position - truth)[:2]))
-    return error, found.radius_68_m, found.radius_95_m, found.attitude.heading
+    turn = abs((found.attitude.heading - yaw + 180) % 360 - 180)
+    heading = turn, found.heading_68_degrees, found.heading_95_degrees
+    return error, found.radius_68_m, found.radius_95_m, *heading
+
+
+def _is_wrong(
+    pose: Outcome, alignment: Alignment, calibration: PoseCalibration, truth: Floats
+) -> bool:
+    if not isinstance(pose, LocalPose):
+        return False
+    error, _, radius_95_m, *_ = _judge(pose, alignment, calibration, truth, 0.0)
+    return error > WRONG_RADII * radius_95_m
 
 
 def _align(mapped: MappedPhotos, truth: Floats) -> Alignment:
@@ -516,10 +509,17 @@ def _noisy_alignments(mapped: MappedPhotos, truth: Floats) -> Iterable[Alignment
         yield _align(mapped, truth + rng.normal(0, COORDINATE_NOISE_M, truth.shape))
 
 
-def _add_coverage(report: Report, what: str, in_68: float, in_95: float) -> None:
-    for name, share, (low, high) in (("68", in_68, COVERAGE_68), ("95", in_95, COVERAGE_95)):
-        report.add(f"{what}: within the radius of {name} %", share, "%", at_least=low)
-        report.add(f"{what}: within the radius of {name} %, not too many", share, "%", at_most=high)
+def _add_coverage(report: Report, what: str, errors: Floats, *radii: Any) -> None:
+    """Report the shares of errors (n,) within their radii of 68 and 95 %, with 95 % intervals."""
+    limits = ("68", COVERAGE_68), ("95", COVERAGE_95)
+    for radius, (name, (low, high)) in zip(radii, limits, strict=True):
+        within = binomtest(int(np.sum(errors <= radius)), len(errors))
+        least, most = (100 * limit for limit in within.proportion_ci(method="wilson"))
+        share = f"{what}: within {name} % ({least:.0f} to {most:.0f} of {len(errors)})"
+        report.add(share, 100 * within.statistic, "%", at_least=low)
+        report.add(
+            f"{what}: within {name} %, not too many", 100 * within.statistic, "%", at_most=high
+        )
 
 
 def _is_query_of(photo: PlannedPhoto, *sessions: str) -> bool:

@@ -173,10 +173,6 @@ def _print_reconstruction(made: Reconstruction, result: Json) -> None:
             print_note(f"{result[what]} {why}: {shown}")
 
 
-def _shorten(names: list[str]) -> str:
-    return ", ".join(names[:MAX_NAMES_SHOWN]) + " ..." * (len(names) > MAX_NAMES_SHOWN)
-
-
 def _format_alignment(component: Component) -> str:
     text = (
         f"{component.alignment_rms_m:.2f} m from the coordinates of {component.agreeing} of "

@@ -63,7 +63,7 @@ class _Decoding:
 
     def photo(self) -> DecodedPhoto:
         photo, sizes = self.future.result()
-        arrays = [np.empty(size, np.uint8) for size in sizes]
+        arrays = [np.empty(size, np.uint8).data for size in sizes]
         os.preadv(self._file, arrays, 0)
         decoded: DecodedPhoto = pickle.loads(photo, buffers=arrays)  # noqa: S301
         return decoded

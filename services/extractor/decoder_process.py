@@ -32,8 +32,7 @@ def decode_into_memory(
     """Write the arrays of the decoded photo to a file in memory.
 
     Args:
-        decode: Decodes a photo.
-        data: The photo.
+        decode: Decodes the photo `data`.
         file_number: Number of the file in the parent process.
         name: Name of the file: the number may be that of another file, if the parent waits no
             longer.

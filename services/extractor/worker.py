@@ -59,24 +59,20 @@ class Stage:
     """A thread that works on one batch at a time."""
 
     def __init__(self, name: str) -> None:
-        self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
+        self.executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
         self._current: Future[None] | None = None
 
     def start(self, work: Callable[[JobBatch], None], batch: JobBatch) -> None:
         """Hand the batch and its lease to the thread; raise what its previous `work` raised."""
         self.wait()
         handed_over = replace(batch, lease=batch.lease.pop_all())
-        self._current = self._executor.submit(work, handed_over)
+        self._current = self.executor.submit(work, handed_over)
 
     def wait(self) -> None:
         """Wait until the thread is free; raise what its `work` raised."""
         current, self._current = self._current, None
         if current is not None:
             current.result()
-
-    def close(self) -> None:
-        """Wait for the thread and end it."""
-        self._executor.shutdown()
 
 
 class ExtractorWorker:
@@ -158,9 +154,8 @@ class ExtractorWorker:
 
     def close(self) -> None:
         """Stop the threads and decoders; claimed jobs are requeued when their lease expires."""
-        for stage in (self._describing, self._publishing):
-            stage.close()
-        self._queries.shutdown()
+        for executor in (self._describing.executor, self._publishing.executor, self._queries):
+            executor.shutdown()
         self.context.close()
 
     def drain(self, stop: threading.Event) -> bool:
@@ -187,8 +182,10 @@ class ExtractorWorker:
         return None if self._stop.is_set() else self._claim()
 
     def _wait_for_stages(self) -> None:
-        self._describing.wait()
-        self._publishing.wait()
+        try:
+            self._describing.wait()
+        finally:
+            self._publishing.wait()
 
     def _claim(self, min_priority: int | None = None, *, alone: bool = True) -> JobBatch | None:
         """Claim the next batch."""
@@ -244,11 +241,7 @@ class ExtractorWorker:
                 self._run_stage(batch, "publish")
 
     def _describe(self, batch: JobBatch, concurrent_jobs: int = 1) -> bool:
-        """Run the stage of the batch that needs the model; return whether one follows.
-
-        `concurrent_jobs` other jobs are in progress at the same time, any of which may be the cause
-        of a crash.
-        """
+        """Run the stage that needs the model; of `concurrent_jobs`, any may cause a crash, too."""
 
         def mark_jobs() -> None:
             # From here on a crash may be caused by a photo: decoding ran in other processes.

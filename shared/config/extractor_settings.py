@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 from typing import Literal, Self
@@ -29,7 +28,6 @@ EXTRACTORS_BY_DINO_MODEL = {
     if name.startswith("anyloc-")
 }
 
-GPU_BATCH_PHOTOS = 64  # a GPU runs more at once hardly faster
 MAX_DECODE_PROCESSES = 64
 
 
@@ -110,16 +108,6 @@ class ExtractorSettings(BaseSettings):
         description="local features of new generations, by which photos are matched: xfeat (at "
         "most 70 kB a photo) or aliked-n16 (132 kB; slower, better; needs the extra `lightglue`)",
     )
-
-    def for_device(self, device: str) -> Self:
-        """Return the settings of a worker on `cpu` or `cuda`, with what is unset chosen for it."""
-        processors = len(os.sched_getaffinity(0))
-        decoders = processors - 2 if device == "cuda" else processors // 4
-        chosen = {"decode_processes": min(max(decoders, 2), MAX_DECODE_PROCESSES)}
-        if device == "cuda":
-            chosen["batch_photos"] = GPU_BATCH_PHOTOS
-        unset = chosen.keys() - self.model_fields_set
-        return self.model_copy(update={name: chosen[name] for name in unset})
 
     @field_validator("code_allowed")
     @classmethod

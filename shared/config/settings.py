@@ -21,7 +21,7 @@ from pydantic_settings import (
     SettingsConfigDict,
 )
 
-from shared.config.extractor_settings import ExtractorSettings
+from shared.config.extractor_settings import MAX_DECODE_PROCESSES, ExtractorSettings
 from shared.config.gateway_settings import GatewaySettings
 from shared.config.search_settings import SearchSettings
 from shared.config.shards import Shard
@@ -31,6 +31,7 @@ from shared.errors import Misconfigured
 # Each may be given as NAME_FILE, too: the path of a file with the value, such as a mounted secret.
 SECRET_SETTINGS = ("ADMIN_KEY", "DATABASE_URL", "REDIS_URL", "S3_ACCESS_KEY", "S3_SECRET_KEY")
 
+GPU_BATCH_PHOTOS = 64  # more at once are hardly faster: docs/how-to/throughput.md
 CGROUP_MEMORY_LIMIT_FILE = Path("/sys/fs/cgroup/memory.max")
 
 
@@ -184,6 +185,16 @@ class Settings(
                 "a batch becomes one chunk, and a chunk must fit into a slot"
             )
         return self
+
+    def for_device(self, device: str) -> Self:
+        """Return the settings of an extractor on `cpu` or `cuda`, which decides what is unset."""
+        processors = len(os.sched_getaffinity(0))
+        decoders = processors - 2 if device == "cuda" else processors // 4
+        chosen = {"decode_processes": min(max(decoders, 2), MAX_DECODE_PROCESSES)}
+        if device == "cuda":
+            chosen["batch_photos"] = min(GPU_BATCH_PHOTOS, self.slot_rows)
+        unset = chosen.keys() - self.model_fields_set
+        return self.model_copy(update={name: chosen[name] for name in unset})
 
     def search_cache_folder(self, shard: Shard) -> Path:
         """The folder where the search worker of a shard caches objects of a bucket."""

@@ -72,28 +72,37 @@ class CoordinateProposal:
     """of the proposed ones: with the errors of the alignment and of the photos that agree"""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ComponentPhotos:
+    """A component with what its photos are localised with."""
+
+    component: Component
+    features: Mapping[UUID, LocalFeatures]
+    """of the component's photos"""
+    descriptors: NDArray[np.float32]
+    """(n, D) L2-normalised, of the component's photos in their order"""
+    seconds: Floats
+    """(n,) when they were taken; NaN where that is unknown"""
+    focal_lengths: Sequence[float | None]
+    """(n,) of EXIF, as multiples of the longer side; None without. With one, the camera of a query
+    is that of the model, unless it was imported without a key"""
+    similarity: Similarity | None
+    """of the component, if it is aligned"""
+
+
 def localise_left_out(
-    component: Component,
-    features: Mapping[UUID, LocalFeatures],
-    descriptors: NDArray[np.float32],
-    seconds: Floats,
-    focal_lengths: Sequence[float | None],
+    photos: ComponentPhotos,
     matcher: Matcher,
-    similarity: Similarity | None,
     on_progress: Callable[[int], None],
     threads: int = min(os.cpu_count() or 1, 4),
 ) -> list[LeftOutPose | None]:
     """Localise at most MAX_PHOTOS photos of a component without themselves; None without a pose.
 
     Args:
-        features: Of the component's photos.
-        descriptors: (n, D) L2-normalised, of the component's photos in their order.
-        seconds: (n,) when they were taken; NaN where that is unknown.
-        focal_lengths: (n,) of EXIF, as multiples of the longer side; None without. With one, the
-            camera of a query is that of the model, unless it was imported without a key.
-        similarity: Of the component, if it is aligned.
         on_progress: Called with the number of photos that are done; what it raises ends the work.
     """
+    component, features, descriptors = photos.component, photos.features, photos.descriptors
+    seconds = photos.seconds
     count = len(component.photo_ids)
     chosen = np.sort(np.random.default_rng(0).permutation(count)[:MAX_PHOTOS])
 
@@ -103,7 +112,7 @@ def localise_left_out(
         similarities = np.where(near, -np.inf, descriptors @ descriptors[row])
         best = np.argsort(-similarities, kind="stable")[: min(CANDIDATES, int((~near).sum()))]
         photo = component.photo_ids[row]
-        camera, source = _query_camera(component, row, features[photo], focal_lengths[row])
+        camera, source = _query_camera(component, row, features[photo], photos.focal_lengths[row])
         found = localise(
             _with_noise(component, row, features[photo]),
             [(component.photo_ids[i], features[component.photo_ids[i]]) for i in best.tolist()],
@@ -113,7 +122,9 @@ def localise_left_out(
             matcher,
             frozenset(component.photo_ids[i] for i in np.flatnonzero(near).tolist()),
         )
-        return _compare(component, row, found, similarity) if isinstance(found, LocalPose) else None
+        if not isinstance(found, LocalPose):
+            return None
+        return _compare(component, row, found, photos.similarity)
 
     done: list[LeftOutPose | None] = []
     with ThreadPoolExecutor(threads, "calibrate") as pool:
@@ -255,18 +266,6 @@ def _quantile(ratios: Floats, level: float, normal: float) -> float:
     return max(normal, float(ratios[-1]) if len(ratios) else normal)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ComponentPhotos:
-    """A component with the arguments of `localise_left_out`."""
-
-    component: Component
-    features: Mapping[UUID, LocalFeatures]
-    descriptors: NDArray[np.float32]
-    seconds: Floats
-    focal_lengths: Sequence[float | None]
-    similarity: Similarity | None
-
-
 def calibrate_components(
     parts: Sequence[ComponentPhotos], matcher: Matcher, on_progress: Callable[[int], None]
 ) -> list[PoseCalibration]:
@@ -282,16 +281,7 @@ def calibrate_components(
         on_progress(done + count)
 
     for part in parts:
-        poses = localise_left_out(
-            part.component,
-            part.features,
-            part.descriptors,
-            part.seconds,
-            part.focal_lengths,
-            matcher,
-            part.similarity,
-            report,
-        )
+        poses = localise_left_out(part, matcher, report)
         done += len(poses)
         found.append(calibrate(poses))
     return found

@@ -7,20 +7,16 @@ tells such matches before a model is made of them.
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import poselib
 from numpy.typing import NDArray
 
 from services.extractor.geometry.matching import VerifiedMatches
-from shared.geometry.cameras import UNKNOWN_FOCAL_LENGTH, Floats
+from shared.geometry.cameras import Floats
 from shared.geometry.frames import GPS_SIGMA_M, UNKNOWN_ALTITUDE_SIGMA_M, Similarity, fit_similarity
-from shared.matching.features import WORKING_SIDE
-from shared.matching.verification import MAX_EPIPOLAR_ERROR_PIXELS
 
 if TYPE_CHECKING:
     from services.extractor.geometry.mapping import PhotoToMap
@@ -28,63 +24,82 @@ if TYPE_CHECKING:
 NEAR_M = 3 * GPS_SIGMA_M
 """Coordinates that are so near each other contradict no match"""
 MAX_STEPS = 3.0
-"""Distance of two photos that match, in usual steps or in what their parallax makes of these"""
+"""Distance of two photos that match, in usual steps"""
+MIN_CONFIRMED = 8
+"""Matches of a pair that lead over a third photo, too"""
+MIN_FIRST_STEPS = 1.4
+"""Usual steps by the coordinates as they are, of which SMOOTHED_WITH of them leave three sigmas"""
 SURE_MATCHES = 2
 """Best pairs of each photo, which are hardly ever wrong"""
 SMOOTHED_WITH = 6
 """Best pairs of each photo whose coordinates make its own more exact"""
 PASSES = 5
 """Each time, the coordinates are made more exact by pairs that have not contradicted them yet"""
-MAX_MEASURED = 150
-"""Pairs of which the usual parallax is measured"""
 MIN_BLOCK = 3
 """Photos that are off together; fewer may have wrong coordinates"""
 MIN_NEARER_SHARE = 0.3
 """of a photo's matches with photos that are nearer by their coordinates than in the model"""
 OFF_SIGMAS, MIN_OFF_M = 4.0, 2.0
 """How far a block is from its coordinates, in standard deviations of all photos' and in metres"""
+MAX_INDEPENDENT = 9
+"""Positions of a block whose errors are independent, at most"""
 RAYLEIGH_MEDIAN = 1.1774
 """Median distance in two dimensions, in standard deviations"""
 
 
-def without_contradictions(
-    photos: Sequence[PhotoToMap], matches: VerifiedMatches
-) -> VerifiedMatches:
-    """Return the matches without those of photos that are too far apart by their coordinates.
+def agreeing_pairs(photos: Sequence[PhotoToMap], matches: VerifiedMatches) -> NDArray[np.bool_]:
+    """Return the (m,) pairs without those of photos that are too far apart by their coordinates.
 
     How far that is, is learned from the best pairs of each photo: the median of their distances
-    contains the photos' steps as well as the errors of their coordinates. Two photos with more
-    parallax than these may be farther apart in proportion. Coordinates that contradict most matches
-    of a photo are not believed, and drop none.
+    contains the photos' steps as well as the errors of their coordinates. Photos that are farther
+    apart agree if a third one, which agrees with both, confirms their matches. Coordinates that
+    contradict most matches of a photo are not believed, and drop none.
     """
     places = {photo.id: photo.position for photo in photos}
     own = np.array([_horizontal(places.get(id_)) for id_ in matches.photo_ids])
     one, other = matches.pairs.reshape(-1, 2).T
     counts = np.array([len(k) for k in matches.keypoints], int)
     contradicts = np.zeros(len(counts), dtype=bool)
-    pixels = {photo.id: _rays(photo) for photo in photos}
-
-    @cache
-    def parallax(pair: int) -> float:
-        of_one, of_other = (pixels[matches.photo_ids[n]] for n in matches.pairs[pair])
-        keypoints = matches.keypoints[pair]
-        return _parallax(of_one[keypoints[:, 0]], of_other[keypoints[:, 1]])
-
-    positions = own
+    positions, first_step = own, 0.0
     for _ in range(PASSES):
         distances = np.linalg.norm(positions[one] - positions[other], axis=1)
         agreeing = np.where(np.isfinite(distances) & ~contradicts, counts, 0)
         sure = _best_pairs(one, other, agreeing)
         step = float(np.median(distances[sure])) if len(sure) else np.inf
-        contradicts = distances > max(NEAR_M, MAX_STEPS * step)
-        if contradicts.any():
-            chosen = np.random.default_rng(0).permutation(sure)[:MAX_MEASURED]
-            usual = max(1e-9, float(np.median([parallax(n) for n in chosen.tolist()])))
-        for pair in np.flatnonzero(contradicts).tolist():
-            reach = MAX_STEPS * step * parallax(pair) / usual
-            contradicts[pair] = distances[pair] > reach
+        first_step = first_step or step
+        contradicts = distances > max(NEAR_M, MAX_STEPS * step, MIN_FIRST_STEPS * first_step)
+        contradicts[_confirmed(matches, contradicts)] = False
         positions = _smoothed(own, one, other, counts, contradicts)
-    return matches.only(~contradicts)
+    return ~contradicts
+
+
+def _confirmed(matches: VerifiedMatches, contradicts: NDArray[np.bool_]) -> list[int]:
+    """Return the contradicting pairs whose matches agree with those that lead over a third photo.
+
+    Both of the third photo's pairs are none of the contradicting.
+    """
+    rows = {}
+    neighbours = defaultdict[int, set[int]](set)
+    for row in np.flatnonzero(~contradicts).tolist():
+        one, other = matches.pairs[row].tolist()
+        rows[one, other], rows[other, one] = (row, 1), (row, -1)
+        neighbours[one].add(other)
+        neighbours[other].add(one)
+
+    def lead(one: int, other: int) -> dict[int, int]:
+        row, direction = rows[one, other]
+        return dict(matches.keypoints[row][:, ::direction].tolist())
+
+    found = []
+    for row in np.flatnonzero(contradicts).tolist():
+        one, other = matches.pairs[row].tolist()
+        for third in neighbours[one] & neighbours[other]:
+            to, back = lead(one, third), lead(third, other)
+            direct = matches.keypoints[row].tolist()
+            if sum(back.get(to.get(a, -1), -1) == b for a, b in direct) >= MIN_CONFIRMED:
+                found.append(row)
+                break
+    return found
 
 
 def _horizontal(position: Floats | None) -> Floats:
@@ -125,46 +140,20 @@ def _smoothed(
     return found
 
 
-def _rays(photo: PhotoToMap) -> Floats:
-    """Return the (n, 2) keypoints in units of the focal length, relative to the photo's middle."""
-    focal = photo.focal_length or UNKNOWN_FOCAL_LENGTH
-    middle = np.array([photo.width, photo.height]) / 2
-    rays: Floats = (photo.pixels - middle) / (focal * max(photo.width, photo.height))
-    return rays
-
-
-def _parallax(rays: Floats, other_rays: Floats) -> float:
-    """Return the distance of two cameras in median distances to what both see."""
-    camera = {"model": "SIMPLE_PINHOLE", "width": 2, "height": 2, "params": [1.0, 0.0, 0.0]}
-    error = MAX_EPIPOLAR_ERROR_PIXELS / WORKING_SIDE
-    options = {"max_epipolar_error": error, "max_iterations": 500, "seed": 0}
-    pose, info = poselib.estimate_relative_pose(rays, other_rays, camera, camera, options, {})
-    is_inlier = np.array(info["inliers"], dtype=bool)
-    if not is_inlier.any():
-        return 0.0
-    first, second = (
-        np.column_stack([r[is_inlier], np.ones(int(is_inlier.sum()))]) for r in (rays, other_rays)
-    )
-    first = first @ pose.R.T
-    # A point is at the depth z of the second camera where first x (z * second - t) = 0.
-    translation = pose.t / max(1e-12, float(np.linalg.norm(pose.t)))
-    across = np.linalg.norm(np.cross(first, second), axis=1)
-    depths = np.linalg.norm(np.cross(first, translation), axis=1) / np.maximum(across, 1e-9)
-    return float(1 / max(1e-9, float(np.median(depths))))
-
-
 def find_misplaced(
     centres: Floats,
     rotations: Sequence[Floats],
     positions: Floats,
     pairs: NDArray[np.int32],
     counts: NDArray[np.intp],
+    blocks: NDArray[np.intp],
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the (n,) photos that a model has at a wrong place, and the (m,) pairs that led there.
 
     Photos that match each other and are off their coordinates together were joined to the rest by
-    matches of something else that looks alike. So was a single photo, if others that it matches are
-    near it by their coordinates, but not in the model; if not, its coordinates are wrong.
+    matches of something else that looks alike. So were one or two photos, if others that they match
+    are near by their coordinates, but not in the model; if not, their coordinates are wrong. So is
+    a block that only looks like the rest, unless its coordinates confirm its place.
 
     Args:
         centres: (n, 3) of the model's photos.
@@ -172,9 +161,11 @@ def find_misplaced(
         positions: (n, 3) metres by their coordinates; NaN where unknown.
         pairs: (m, 2) numbers of photos that match.
         counts: (m,) matches of each pair.
+        blocks: (n,) of `find_lookalikes`.
     """
-    nothing = np.zeros(len(centres), dtype=bool), np.zeros(len(pairs), dtype=bool)
-    known = np.flatnonzero(np.isfinite(positions[:, :2]).all(axis=1))
+    is_alike = blocks > 0
+    nothing = is_alike, np.zeros(len(pairs), dtype=bool)
+    known = np.flatnonzero(np.isfinite(positions[:, :2]).all(axis=1) & ~is_alike)
     if len(known) < MIN_BLOCK:
         return nothing
     fitted = fit_to_positions(
@@ -186,18 +177,34 @@ def find_misplaced(
     own = positions[:, :2] - modelled
     one, other = pairs.reshape(-1, 2).T
     shared = _smoothed(own, one, other, counts, nothing[1])
-    off, off_together = (_is_off(offsets) for offsets in (own, shared))
+    limit = _limit(own)
+    off = np.linalg.norm(own, axis=1) > limit
+    # Medians of SMOOTHED_WITH positions and the photo's own are twice as exact as these.
+    off_together = np.linalg.norm(shared, axis=1) > max(_limit(shared), limit / 2)
     near, modelled_near = (
         np.linalg.norm(places[one] - places[other], axis=1) for places in (positions, modelled)
     )
-    off_together &= _has_size(off_together, one, other)
-    limit = math.sqrt(2) * _limit(own)  # of the distance of two photos
-    for photo in np.flatnonzero(off & ~off_together).tolist():
-        of_photo = (one == photo) | (other == photo)
-        nearer = of_photo & (2 * near < modelled_near) & (modelled_near > _limit(own))
-        off_together[photo] = counts[nearer].sum() >= MIN_NEARER_SHARE * counts[of_photo].sum()
-    contradicts = (off_together[one] | off_together[other]) & (near > modelled_near + limit)
-    return off_together, contradicts
+    groups = _groups(off_together, one, other)
+    off_together &= np.bincount(groups)[groups] >= MIN_BLOCK
+    off &= ~off_together
+    groups = _groups(off, one, other)
+    for group in np.unique(groups[off]):
+        members = off & (groups == group)
+        crossing = members[one] != members[other]
+        nearer = crossing & (2 * near < modelled_near) & (modelled_near > limit)
+        off_together |= members & (
+            counts[nearer].sum() >= max(1, MIN_NEARER_SHARE * counts[crossing].sum())
+        )
+    contradicts = (off_together[one] | off_together[other]) & (
+        near > modelled_near + math.sqrt(2) * limit
+    )
+    for block in np.unique(blocks[is_alike]):
+        offsets = own[(blocks == block) & np.isfinite(own[:, 0])]
+        # Its mean is more exact than each position, but receivers are off by the same for minutes.
+        exactness = limit / math.sqrt(max(1, min(MAX_INDEPENDENT, len(offsets))))
+        apart = np.linalg.norm(np.mean(offsets, axis=0)) if len(offsets) else np.inf
+        is_alike[blocks == block] = not apart <= max(MIN_OFF_M, exactness)
+    return off_together | is_alike, contradicts
 
 
 def _limit(offsets: Floats) -> float:
@@ -206,22 +213,16 @@ def _limit(offsets: Floats) -> float:
     return max(MIN_OFF_M, OFF_SIGMAS * float(np.nanmedian(distances)) / RAYLEIGH_MEDIAN)
 
 
-def _is_off(offsets: Floats) -> NDArray[np.bool_]:
-    found: NDArray[np.bool_] = np.linalg.norm(offsets, axis=1) > _limit(offsets)
-    return found
-
-
-def _has_size(is_off: NDArray[np.bool_], one: Any, other: Any) -> NDArray[np.bool_]:
-    """Return the photos that are in a group of MIN_BLOCK matched ones or more that are off."""
-    joined = is_off[one] & is_off[other]
+def _groups(is_member: NDArray[np.bool_], one: Any, other: Any) -> NDArray[np.intp]:
+    """Return the least number of the members that each photo is joined with by matches of these."""
+    joined = is_member[one] & is_member[other]
     one, other = one[joined], other[joined]
-    labels, before = np.arange(len(is_off)), None
+    labels, before = np.arange(len(is_member)), None
     while before is None or (labels != before).any():  # each photo takes the least of its group
         before = labels.copy()
         np.minimum.at(labels, one, before[other])
         np.minimum.at(labels, other, labels[one])
-    found: NDArray[np.bool_] = np.bincount(labels)[labels] >= MIN_BLOCK
-    return found
+    return labels
 
 
 def fit_to_positions(

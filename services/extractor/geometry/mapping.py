@@ -10,6 +10,7 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.extractor.child_process import run_in_child
-from services.extractor.geometry.evidence import without_contradictions
+from services.extractor.geometry.evidence import agreeing_pairs
 from services.extractor.geometry.matching import VerifiedMatches
 from services.extractor.geometry.positions import adjust_to_positions, misplaced_photos
 from shared.errors import Misconfigured, Unprocessable
@@ -209,9 +210,10 @@ def _map(
                 )
             return sorted(found.values(), key=lambda model: -model.num_reg_images())
 
-        matches = without_contradictions(photos, matches)
+        is_used = agreeing_pairs(photos, matches)
+        by_name = {str(photo.id): photo for photo in photos}
         database = Path(scratch) / "first.db"
-        _write_database(pycolmap, photos, matches, database, models)
+        _write_database(pycolmap, photos, matches.only(is_used), database, models)
         rest = {str(photo.id) for photo in photos} - {name for m in models for name in _names(m)}
         found: list[Any] = []
         for number, model in enumerate(models):
@@ -225,7 +227,7 @@ def _map(
 
         def attempt(tried: Sequence[PhotoToMap], is_known: bool, names: set[str]) -> list[Any]:
             path = next(databases)
-            _write_database(pycolmap, tried, matches, path, models)
+            _write_database(pycolmap, tried, matches.only(is_used), path, models)
             return run(path, "", names, is_known)
 
         anew: list[Any] = []
@@ -244,13 +246,16 @@ def _map(
                 anew = max(anew, again, key=_registered)
             for each in anew:
                 adjust_to_positions(pycolmap, each, photos)
-            judged = [misplaced_photos(each, photos, matches) for each in anew]
+            judge = partial(misplaced_photos, photos=photos, matches=matches, is_used=is_used)
+            judged = [judge(_component_of(each, by_name)) for each in anew]
             wrong = np.any([contradicts for _, contradicts in judged], axis=0)
             if cuts == MAX_CUTS or not wrong.any():
                 for each, (misplaced, _) in zip(anew, judged, strict=True):
-                    _deregister(each, misplaced)
+                    while misplaced:  # without these, others may have nothing that holds them
+                        _deregister(each, misplaced)
+                        misplaced, _ = judge(_component_of(each, by_name))
                 break
-            matches = matches.only(~wrong)
+            is_used &= ~wrong
         plausible = [each for each in anew if _bent_focal_length(each) is None]
         if anew and not found and not plausible:
             raise Unprocessable(
@@ -556,25 +561,32 @@ def _deregister(model: Any, names: AbstractSet[str]) -> None:
 
 
 def _without_shared_photos(models: Sequence[Any]) -> list[Any]:
-    """Return the models, most photos first, each without the photos of those before it.
+    """Return the models, most photos first, each photo in that where it shows most points.
 
     pycolmap lets the models of one run overlap. A photo in two frames would have two poses.
     """
+    shown: dict[str, int] = {}
+    for model in models:
+        for number in model.reg_image_ids():
+            image = model.image(number)
+            shown[image.name] = max(shown.get(image.name, 0), image.num_points3D)
     disjoint: list[Any] = []
-    names: set[str] = set()
+    taken: set[str] = set()
     for model in sorted(models, key=lambda model: -model.num_reg_images()):
-        _deregister(model, names)
+        images = [model.image(number) for number in model.reg_image_ids()]
+        elsewhere = {each.name for each in images if each.num_points3D < shown[each.name]}
+        _deregister(model, taken | elsewhere)
         is_enough = model.num_reg_images() >= MIN_MODEL_PHOTOS
         if is_enough and model.num_points3D() >= MIN_MODEL_POINTS:
             disjoint.append(model)
-            names.update(_names(model))
+            taken.update(_names(model))
     return disjoint
 
 
 def _component_of(
-    model: Any, photos: Mapping[str, PhotoToMap], scales: Mapping[int, float]
+    model: Any, photos: Mapping[str, PhotoToMap], scales: Mapping[int, float] = MappingProxyType({})
 ) -> Component:
-    """Return the component of a model at the working size."""
+    """Return the component of a model at the working size; `scales` of cameras lead to photos'."""
     point_ids = sorted(model.point3D_ids())
     number_of = {point: number for number, point in enumerate(point_ids)}
     xyz = np.array([model.point3D(point).xyz for point in point_ids]).reshape(-1, 3)
@@ -607,7 +619,8 @@ def _component_of(
         np.array(cameras, np.int32),
         tuple(numbers_of_photos),
         tuple(
-            _stored_camera(model.camera(number), scales[number]) for number in sorted(model.cameras)
+            _stored_camera(model.camera(number), scales.get(number, 1.0))
+            for number in sorted(model.cameras)
         ),
         xyz,
         bounded_inverse(information).astype(np.float32),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 from uuid import UUID
 
@@ -16,8 +16,10 @@ from services.extractor.geometry.evidence import (
     fit_to_positions,
     with_heights,
 )
+from services.extractor.geometry.lookalikes import find_lookalikes
 from services.extractor.geometry.matching import VerifiedMatches
 from shared.geometry.cameras import Floats
+from shared.geometry.component import Component
 from shared.geometry.frames import UNKNOWN_ALTITUDE_SIGMA_M
 
 if TYPE_CHECKING:
@@ -27,34 +29,48 @@ MIN_PRIOR_SIGMA_M = 0.1
 """Least standard deviation of coordinates"""
 
 
-def _placed(model: Any, photos: Sequence[PhotoToMap]) -> tuple[list[Any], Floats, list[Floats]]:
-    """Return a model's images, their centres (n, 3) and positions, NaN where these are unknown."""
-    of_name = {str(photo.id): photo.position for photo in photos}
-    images = [model.image(number) for number in sorted(model.reg_image_ids())]
-    places = [of_name[image.name] for image in images]
-    positions = np.array([np.full(3, np.nan) if place is None else place for place in places])
-    return images, positions, [image.cam_from_world().rotation.matrix() for image in images]
+def _positions(ids: Iterable[UUID], photos: Sequence[PhotoToMap]) -> Floats:
+    """Return the positions (n, 3) of photos, NaN where they are unknown."""
+    of_id = {photo.id: photo.position for photo in photos}
+    unknown = np.full(3, np.nan)
+    places = [unknown if of_id[id_] is None else of_id[id_] for id_ in ids]
+    return np.array(places, float).reshape(-1, 3)
 
 
 def misplaced_photos(
-    model: Any, photos: Sequence[PhotoToMap], matches: VerifiedMatches
+    component: Component,
+    photos: Sequence[PhotoToMap],
+    matches: VerifiedMatches,
+    is_used: NDArray[np.bool_],
 ) -> tuple[set[str], NDArray[np.bool_]]:
-    """Return the names of a model's misplaced photos, and the (m,) matches that led there."""
-    images, positions, rotations = _placed(model, photos)
-    rows = {UUID(image.name): row for row, image in enumerate(images)}
+    """Return the names of a component's misplaced photos, and the (m,) matches that led there.
+
+    They contradict their coordinates, or are a block that only looks like the rest.
+
+    Args:
+        is_used: (m,) matches that the component was made of; all tell whether it is right.
+    """
+    positions = _positions(component.photo_ids, photos)
+    rows = {id_: row for row, id_ in enumerate(component.photo_ids)}
     numbers = np.array([rows.get(id_, -1) for id_ in matches.photo_ids], np.int32)[matches.pairs]
     inside = np.flatnonzero((numbers >= 0).all(axis=1))
-    counts = np.array([len(k) for k in matches.keypoints], int)
+    used = inside[is_used[inside]]
+    counts = np.array([len(keypoints) for keypoints in matches.keypoints], int)
+    blocks, excess = find_lookalikes(component, numbers[inside], counts[inside])
     misplaced, wrong = find_misplaced(
-        np.array([image.projection_center() for image in images]),
-        rotations,
+        component.centres(),
+        [component.rotation(row) for row in range(len(positions))],
         positions,
-        numbers[inside],
-        counts[inside],
+        numbers[used],
+        counts[used],
+        blocks,
     )
-    contradicts = np.zeros(len(matches.pairs), dtype=bool)
-    contradicts[inside[wrong]] = True
-    return {images[row].name for row in np.flatnonzero(misplaced)}, contradicts
+    is_alike = misplaced & (blocks > 0)
+    contradicts = np.zeros(len(is_used), dtype=bool)
+    contradicts[inside] = (is_alike[numbers[inside]].sum(axis=1) == 1) & (excess != 0)
+    contradicts[used] |= wrong
+    names = {str(component.photo_ids[row]) for row in np.flatnonzero(misplaced)}
+    return names, contradicts & is_used
 
 
 def adjust_to_positions(pycolmap: Any, model: Any, photos: Sequence[PhotoToMap]) -> None:
@@ -62,7 +78,9 @@ def adjust_to_positions(pycolmap: Any, model: Any, photos: Sequence[PhotoToMap])
 
     Their standard deviation is that of the model's distances from them.
     """
-    images, positions, rotations = _placed(model, photos)
+    images = [model.image(number) for number in sorted(model.reg_image_ids())]
+    positions = _positions((UUID(image.name) for image in images), photos)
+    rotations = [image.cam_from_world().rotation.matrix() for image in images]
     known = np.flatnonzero(np.isfinite(positions[:, :2]).all(axis=1))
     if len(known) < MIN_BLOCK:
         return

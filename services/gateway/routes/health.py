@@ -146,7 +146,11 @@ def livez() -> ProbeResponse:
 
 
 @probe_router.head("/readyz", include_in_schema=False)
-@probe_router.get("/readyz", operation_id="readyz")
+@probe_router.get(
+    "/readyz",
+    operation_id="readyz",
+    responses={503: {"model": ProbeResponse, "description": "A component is unavailable."}},
+)
 def readyz(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> ProbeResponse:
     """Readiness probe: 503 while a component that every request needs is unavailable.
 
@@ -160,7 +164,12 @@ def readyz(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> 
 
 
 @router.head("/health", include_in_schema=False, dependencies=[READ])
-@router.get("/health", operation_id="health", dependencies=[READ])
+@router.get(
+    "/health",
+    operation_id="health",
+    responses={503: {"model": HealthResponse, "description": "Not all components are healthy."}},
+    dependencies=[READ],
+)
 def read_health(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> HealthResponse:
     """Get the health of each component; 503 unless all are healthy.
 

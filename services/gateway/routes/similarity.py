@@ -97,7 +97,7 @@ def search_by_stored_photo(
     """
     search_params = query.search_params(with_pose=geopose)
     answer = find_similar(gateway, query_from_photo(gateway, query.map, file_id), search_params)
-    return with_geopose(answer, search_params, geopose)
+    return with_geopose(answer, geopose)
 
 
 @router.post(
@@ -253,7 +253,7 @@ def _queue_geopose(gateway: GatewayContext, map_name: str, sent: GeoPoseRequest)
 
 def _result_of(gateway: GatewayContext, job: Job, geopose: bool) -> Any:
     """The result of a finished query job, as GeoPose if that is accepted."""
-    return with_geopose(_answer_of(gateway, job), query_job_search_params(job), geopose)
+    return with_geopose(_answer_of(gateway, job), geopose)
 
 
 def _answer_of(gateway: GatewayContext, job: Job) -> SimilarityResponse:

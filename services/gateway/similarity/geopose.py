@@ -45,7 +45,7 @@ GEOPOSE: dict[int | str, dict[str, Any]] = {
                 "schema": {
                     "type": "object",
                     "required": ["position"],
-                    "description": "the pose as OGC GeoPose 1.0, in the form `geopose`; 422 "
+                    "description": "the pose as OGC GeoPose 1.0, Basic-Quaternion; 422 "
                     "(`no_pose`) if there is none",
                 }
             }
@@ -73,12 +73,11 @@ GeoPoseDep = Annotated[bool, Depends(_accepts_geopose)]
 """Whether the answer is to be a GeoPose."""
 
 
-def with_geopose(answer: SimilarityResponse, search_params: SearchParams, accepted: bool) -> Any:
+def with_geopose(answer: SimilarityResponse, accepted: bool) -> Any:
     """Return the answer, or its pose as GeoPose if that is accepted; raises as `require_pose`."""
     if not accepted:
         return answer
-    content = geopose(require_pose(answer), search_params.geopose)
-    return JSONResponse(content, media_type=MEDIA_TYPE)
+    return JSONResponse(geopose(require_pose(answer)), media_type=MEDIA_TYPE)
 
 
 def require_pose(answer: SimilarityResponse) -> CameraPoseResponse:
@@ -90,9 +89,9 @@ def require_pose(answer: SimilarityResponse) -> CameraPoseResponse:
     return answer.pose
 
 
-def geopose(pose: CameraPoseResponse, form: str) -> dict[str, dict[str, Any]]:
+def geopose(pose: CameraPoseResponse) -> dict[str, dict[str, float]]:
     """Return the pose as a GeoPose; Unprocessable (`no_pose`) if it is not complete."""
-    if pose.latitude is None or pose.longitude is None:
+    if pose.latitude is None or pose.longitude is None or pose.enu_quaternion is None:
         raise Unprocessable("no_pose", f"The pose has no coordinates. {pose.reason}")
     if pose.altitude_m is None:
         raise Unprocessable(
@@ -100,14 +99,7 @@ def geopose(pose: CameraPoseResponse, form: str) -> dict[str, dict[str, Any]]:
             "The pose has no height, which a GeoPose needs: too few photos of the map have an "
             "altitude. Set `altitude` of some, and run `placewise reconstruct`.",
         )
-    assert pose.heading is not None
-    assert pose.pitch is not None
-    assert pose.enu_quaternion is not None
     position = {"lat": pose.latitude, "lon": pose.longitude, "h": pose.altitude_m}
-    if form == "ypr":
-        yaw = (270 - pose.heading) % 360 - 180
-        angles = {"yaw": yaw, "pitch": -pose.pitch, "roll": pose.roll}
-        return {"position": position, "angles": angles}
     return {"position": position, "quaternion": dict(zip("wxyz", pose.enu_quaternion, strict=True))}
 
 
@@ -229,5 +221,5 @@ class GeoPoseResponse(ResponseModel):
             id=request.id,
             timestamp=request.timestamp,
             accuracy={"position": pose.radius_68_m, "orientation": pose.heading_68_degrees},
-            geopose=geopose(pose, "quaternion"),
+            geopose=geopose(pose),
         )

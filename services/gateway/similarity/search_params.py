@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from datetime import datetime
-from typing import Literal
 from uuid import UUID
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -172,11 +171,6 @@ class RankingParams(BaseModel):
         le=100,
         description="Focal length of the query's camera in pixels, divided by the photo's longer "
         "side. Default: that of the EXIF, or else it is estimated.",
-    )
-    geopose: Literal["quaternion", "ypr"] = Field(
-        "quaternion",
-        description="Form of the answer to `Accept: application/geopose+json`: Basic-Quaternion or "
-        "Basic-YPR of OGC GeoPose 1.0.",
     )
     elsewhere: float | None = Field(
         None,

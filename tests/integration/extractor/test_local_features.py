@@ -273,7 +273,7 @@ def test_model_change_copies_the_features_of_the_active_generation(
     detector = harness.worker.context.models.detector("xfeat")
     detect = detector.detect
 
-    def count(*photo: Any) -> LocalFeatures:
+    def count(*photo: Any) -> list[LocalFeatures]:
         detected.append(1)
         return detect(*photo)
 

@@ -113,7 +113,7 @@ def pretend_gpu(monkeypatch: pytest.MonkeyPatch, total: int) -> None:
 def test_memory_that_is_enough_is_shown_with_the_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
     pretend_gpu(monkeypatch, 16 * GB)
     reported = check_memory(settings_with(monkeypatch, DINO_MODEL="dinov2_vitg14", DEVICE="cuda"))
-    assert "anyloc-vitg14 requires about 6.2 GB (weights 4.5, a batch of 16 photos 0.6)" in reported
+    assert "anyloc-vitg14 requires about 8.1 GB (weights 4.5, a batch of 64 photos 2.6)" in reported
     assert "the GPU has 16.0 GB" in reported
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,22 @@ def test_env_file_is_read_and_the_environment_goes_before_it(
     monkeypatch.setenv("HOST", "::1")
     settings = Settings()
     assert (settings.port, settings.host) == (1234, "::1")
+
+
+@pytest.mark.parametrize(
+    ("device", "processors", "batch", "decoders"),
+    [("cpu", 1, 16, 2), ("cpu", 16, 16, 4), ("cuda", 1, 64, 2), ("cuda", 16, 64, 14)],
+)
+def test_batches_and_decoders_follow_from_the_device_unless_they_are_set(
+    monkeypatch: pytest.MonkeyPatch, device: str, processors: int, batch: int, decoders: int
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(processors)))
+    chosen = Settings().for_device(device)
+    assert (chosen.batch_photos, chosen.decode_processes) == (batch, decoders)
+    monkeypatch.setenv("BATCH_PHOTOS", "7")
+    monkeypatch.setenv("DECODE_PROCESSES", "3")
+    kept = Settings().for_device(device)
+    assert (kept.batch_photos, kept.decode_processes) == (7, 3)
 
 
 def test_home_is_absolute_wherever_the_process_goes(

@@ -68,18 +68,3 @@ def test_camera_of_parameters_sees_as_that_of_pycolmap_does(model: str) -> None:
     pixels = np.random.default_rng(0).uniform((5, 5), (635, 475), (50, 2))
     seen = np.array(theirs.cam_from_img(pixels)) * ours.focal_pixels + (320, 240)
     np.testing.assert_allclose(ours.undistort(pixels), seen, atol=0.02)
-
-
-@pytest.mark.parametrize(
-    ("model", "values", "problem"),
-    [
-        ("FISHEYE", [400.0, 320.0, 240.0], "none of SIMPLE_PINHOLE"),
-        ("PINHOLE", [400.0, 320.0, 240.0], "4 parameters: fx, fy, cx, cy"),
-        ("PINHOLE", [400.0, 0.0, 320.0, 240.0], "fx, fy"),
-    ],
-)
-def test_wrong_parameters_of_a_camera_are_named(
-    model: str, values: list[float], problem: str
-) -> None:
-    with pytest.raises(ValueError, match=problem):
-        Camera.of_parameters(model, values, (640, 480))

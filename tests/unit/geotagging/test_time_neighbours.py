@@ -91,5 +91,5 @@ def test_a_clock_without_a_zone_has_that_of_the_nearest_photo_by_the_same_camera
     ]
     assert [each.time_zone_is_known for each in zoned] == [True, True, True, True, False, False]
     neighbours = TimeNeighbours(zoned, together=False)
-    assert neighbours.why_unknown(zoned[4]).endswith("the time zone of its clock is missing")
-    assert neighbours.why_unknown(zoned[1]) == "nothing is known about its place"
+    assert neighbours.why_unknown(zoned[4], None).endswith("the time zone of its clock is missing")
+    assert neighbours.why_unknown(zoned[1], None) == "nothing is known about its place"

@@ -40,7 +40,9 @@ def test_photos_of_a_scene_are_mapped_aligned_and_judged(scene: ReconstructedSce
     for number in range(PHOTOS):
         pose = mapped.localise(features[number])
         assert isinstance(pose, LocalPose)
-        error, radius_68_m, radius_95_m, _ = _judge(pose, alignment, calibration, truth[number])
+        error, radius_68_m, radius_95_m, *_ = _judge(
+            pose, alignment, calibration, truth[number], 0.0
+        )
         assert error < 3
         assert 0 < radius_68_m < radius_95_m
     assert len(mapped.pose_seconds) == PHOTOS

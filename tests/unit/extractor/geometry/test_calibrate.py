@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from services.extractor.geometry.calibrate import (
+    ComponentPhotos,
     CoordinateProposal,
     LeftOutPose,
     calibrate,
@@ -42,16 +43,15 @@ def left_out(
     features: Mapping[UUID, LocalFeatures] | None = None,
 ) -> list[LeftOutPose | None]:
     reports: list[int] = []
-    found = localise_left_out(
+    photos = ComponentPhotos(
         component or scene.component,
         features or scene.features,
         np.eye(COUNT, dtype=np.float32),
         seconds,
         [500 / 640 if n % 2 else None for n in range(COUNT)],
-        MutualNearest(0.9),
         similarity,
-        reports.append,
     )
+    found = localise_left_out(photos, MutualNearest(0.9), reports.append)
     assert reports == list(range(1, COUNT + 1))
     return found
 

@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from services.extractor.geometry.evidence import find_misplaced, without_contradictions
+from services.extractor.geometry.evidence import agreeing_pairs, find_misplaced
 from services.extractor.geometry.mapping import PhotoToMap
 from services.extractor.geometry.matching import VerifiedMatches, match_pairs
 from shared.geometry.frames import rotation_of_vector
@@ -54,7 +54,8 @@ def test_matches_of_two_streets_that_look_alike_are_dropped(
     positions = 3 * scene.component.centres()
     positions[PHOTOS // 2 :, 1] += STREET_M
     positions += np.random.default_rng(0).normal(0, noise_m, positions.shape)
-    kept = without_contradictions(photos_at(scene, positions), weaker_between_streets(matches))
+    matches = weaker_between_streets(matches)
+    kept = matches.only(agreeing_pairs(photos_at(scene, positions), matches))
     is_second = kept.pairs >= PHOTOS // 2
     assert (is_second[:, 0] == is_second[:, 1]).all()
     assert len(kept.pairs) == sum(1 for _ in combinations(range(PHOTOS // 2), 2)) * 2
@@ -65,8 +66,7 @@ def test_photo_with_wrong_coordinates_keeps_its_matches(
 ) -> None:
     positions = 3 * scene.component.centres()
     positions[4, 1] += STREET_M
-    kept = without_contradictions(photos_at(scene, positions), matches)
-    assert len(kept.pairs) == len(matches.pairs)
+    assert agreeing_pairs(photos_at(scene, positions), matches).all()
 
 
 def test_photos_without_coordinates_keep_their_matches(
@@ -76,7 +76,7 @@ def test_photos_without_coordinates_keep_their_matches(
         PhotoToMap(p, f.width, f.height, f.pixels().astype(np.float32))
         for p, f in scene.features.items()
     ]
-    assert len(without_contradictions(photos, matches).pairs) == len(matches.pairs)
+    assert agreeing_pairs(photos, matches).all()
 
 
 class FoldedWalk:
@@ -107,7 +107,7 @@ class FoldedWalk:
     def misplaced(self) -> tuple[set[int], np.ndarray]:
         """Return the misplaced photos, and the pairs that led there."""
         photos, pairs = find_misplaced(
-            self.centres, self.rotations, self.seen, self.pairs, self.counts
+            self.centres, self.rotations, self.seen, self.pairs, self.counts, np.zeros(52, int)
         )
         return set(np.flatnonzero(photos).tolist()), self.pairs[pairs]
 
