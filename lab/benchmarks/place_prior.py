@@ -20,7 +20,7 @@ weak the evidence of a right answer can be.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import chain
@@ -53,6 +53,7 @@ from shared.evaluation.places.probability import (
 )
 from shared.geodesy import EARTH_RADIUS_M
 from shared.matching.detectors import load_detector
+from shared.matching.features import LocalFeatures
 from shared.matching.matchers import MutualNearest
 
 OWN, QUERIES = "own photos", "queries"
@@ -143,17 +144,17 @@ def fit_log_odds(maps: Iterable[Mapping[str, FloatArray]]) -> Coefficients:
         for name, features in each.items()
     ]
     width = rows[0][1].shape[1]
-    used, slopes = np.zeros(width), np.ones(width)
+    used, slopes = np.ones(width, dtype=bool), np.ones(width)
     while (slopes > 0).any():
-        used = np.where(slopes > 0, 1 - used, used)
         table = RegressionTable.of_rows(
             (row * used, is_elsewhere, MAP_WEIGHT * share / len(features))
             for is_elsewhere, features, share in rows
             for row in features
         )
         plain = PlacePrior(means=(0.0,) * width, scales=(1.0,) * width, level=(), missing_place=())
-        intercept, *slopes = fit_map_estimate(table, (0.0,) * (1 + width), plain, 0.01)
-        slopes = np.array(slopes)
+        intercept, *fitted = fit_map_estimate(table, (0.0,) * (1 + width), plain, 0.01)
+        slopes = np.array(fitted)
+        used &= slopes <= 0
     # As in conformal prediction, one more photo, which passes, is counted.
     least = min(
         np.sort(intercept + features @ slopes)[max(0, (len(features) + 1) // 20 - 1)]
@@ -182,13 +183,19 @@ def fit_elsewhere(folders: Sequence[Path]) -> None:
     """Write what photos of elsewhere score, with each of the sets that has places as a map."""
     prior, detector = shipped_prior(), load_detector("xfeat", torch.device("cpu"))
     matcher = MutualNearest.of_model(detector.model)
-    local = cache(lambda path: detect_all(detector, [path], lambda: None)[0][0])
+
+    @cache
+    def features(path: Path) -> LocalFeatures:
+        return detect_all(detector, [path], lambda: None)[0][0]
+
+    def features_of(paths: Sequence[Path]) -> Callable[[int], LocalFeatures]:
+        return lambda number: features(paths[number])
+
     found: dict[tuple[str, str], list[tuple[str, dict[str, FloatArray]]]] = {}
     with Progress(console=console) as progress:
         for photos in chain(*(describe_sets(folders, progress, own) for own in (True, False))):
             background = TrialMap(photos, photos.is_database).background
-            paths = photos.paths
-            matched = MatchedPhotos(lambda number, paths=paths: local(paths[number]), matcher)
+            matched = MatchedPhotos(features_of(photos.paths), matcher)
             kinds = {"coefficients": None, "matched": matched.match}
             for kind, match in list(kinds.items())[: 2 if photos.extractor else 1]:
                 levels = elsewhere_levels(replace(photos, match=match))

@@ -295,7 +295,7 @@ class TimeNeighbours:
         position = interpolate_position(known, photo.time, max_speed_mps)
         return position and replace(position, same_camera=False)
 
-    def why_unknown(self, photo: DatedPhoto, picture: PictureEvidence | None) -> str:
+    def why_unknown(self, photo: DatedPhoto, picture: PictureEvidence | None = None) -> str:
         """Say why no position is proposed for a photo."""
         if picture is not None and picture.headline:
             return picture.headline

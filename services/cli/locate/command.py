@@ -215,9 +215,8 @@ def _search_photo(client: Client, photo_count: int, photo: FolderPhoto) -> Searc
             raise
         return SearchedPhoto(error=error.detail)
     estimate = answer.estimate
-    label = next((each for each in estimate.levels if each.place), None)
-    if estimate.in_map is False:  # its headline names no place
-        label = None
+    named = () if estimate.in_map is False else estimate.levels
+    label = next((each for each in named if each.place), None)
     return SearchedPhoto(
         picture_evidence(answer, photo_count),
         label.place if label else None,

@@ -176,8 +176,7 @@ class RankingParams(BaseModel):
         None,
         gt=0,
         lt=1,
-        description="Share of your queries that are from elsewhere than the map. Default: the "
-        "map's `elsewhere`.",
+        description="Share of your queries that are from elsewhere. Default: the map's.",
     )
     certainty: float | None = Field(
         None,
