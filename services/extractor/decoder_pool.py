@@ -12,12 +12,14 @@ import logging
 import multiprocessing
 import os
 import pickle
+import tempfile
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import TimeoutError as TimedOut
 from concurrent.futures import wait
 from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
 
 import numpy as np
 from pebble import ProcessExpired, ProcessFuture, ProcessPool
@@ -52,10 +54,16 @@ class _Decoding:
 
     def __init__(self, pool: ProcessPool, data: bytes, decode: Decode, timeout: float) -> None:
         name = f"photo-{new_id()}"
-        self._file = os.memfd_create(name)
+        self._path: str | None = None
+        if hasattr(os, "memfd_create"):
+            self._file = os.memfd_create(name)
+            path = f"/proc/{os.getpid()}/fd/{self._file}"
+        else:  # not Linux
+            self._file, self._path = tempfile.mkstemp(prefix=name)
+            path = self._path
         try:
             self.future: ProcessFuture[tuple[bytes, list[int]]] = pool.schedule(
-                decode_into_memory, args=[decode, data, self._file, name], timeout=timeout
+                decode_into_memory, args=[decode, data, path, name], timeout=timeout
             )
         except RuntimeError as error:  # raised by pebble when the pool is not running
             self.close()
@@ -70,6 +78,8 @@ class _Decoding:
 
     def close(self) -> None:
         os.close(self._file)
+        if self._path is not None:
+            Path(self._path).unlink()
 
 
 class DecoderPool:

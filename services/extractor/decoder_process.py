@@ -6,7 +6,6 @@ reader would hold the worker's interpreter meanwhile.
 
 from __future__ import annotations
 
-import os
 import pickle
 import resource
 from collections.abc import Callable
@@ -27,15 +26,14 @@ def limit_memory(limit_bytes: int) -> None:
 
 
 def decode_into_memory(
-    decode: Callable[[bytes], object], data: bytes, file_number: int, name: str
+    decode: Callable[[bytes], object], data: bytes, path: str, name: str
 ) -> tuple[bytes, list[int]]:
     """Write the arrays of the decoded photo to a file in memory.
 
     Args:
         decode: Decodes the photo `data`.
-        file_number: Number of the file in the parent process.
-        name: Name of the file: the number may be that of another file, if the parent waits no
-            longer.
+        path: Path of the file.
+        name: Name of the file: the path may be that of another file, if the parent waits no longer.
 
     Returns:
         The pickled photo without its arrays, and the sizes of these.
@@ -45,8 +43,9 @@ def decode_into_memory(
     """
     buffers: list[pickle.PickleBuffer] = []
     photo = pickle.dumps(decode(data), protocol=5, buffer_callback=buffers.append)
-    with Path(f"/proc/{os.getppid()}/fd/{file_number}").open("r+b", buffering=0) as file:
-        if str(Path(f"/proc/self/fd/{file.fileno()}").readlink()) != f"/memfd:{name} (deleted)":
+    with Path(path).open("r+b", buffering=0) as file:
+        opened = Path(f"/proc/self/fd/{file.fileno()}")  # of Linux alone
+        if opened.is_symlink() and name not in str(opened.readlink()):
             raise FileNotFoundError(name)
         arrays = [buffer.raw() for buffer in buffers]
         for array in arrays:

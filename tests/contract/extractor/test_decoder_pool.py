@@ -211,10 +211,20 @@ def test_process_whose_photo_nobody_waits_for_writes_to_no_other_file(
     other = tmp_path / "catalog.db"
     other.write_bytes(b"rows")
     with other.open("rb") as file:
-        arguments = [bytes, GOOD, file.fileno(), "photo-of-before"]
+        path = f"/proc/{os.getpid()}/fd/{file.fileno()}"
+        arguments = [bytes, GOOD, path, "photo-of-before"]
         with pytest.raises(FileNotFoundError, match="photo-of-before"):
             pool._pool.schedule(decode_into_memory, args=arguments).result()
     assert other.read_bytes() == b"rows"
+
+
+def test_pixels_pass_through_temporary_files_where_there_are_none_in_memory(
+    pool: DecoderPool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr("os.memfd_create")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert is_good(pool.decode([GOOD], SQUARE)[0])
+    assert not list(tmp_path.iterdir())
 
 
 def test_memory_is_released_when_a_batch_ends_early(pool: DecoderPool) -> None:
