@@ -22,6 +22,8 @@ SAME_VIEW_COSINE, SAME_VIEW_SCALE = math.cos(math.radians(20)), 1.5
 """A detector finds a point again from directions and distances that differ by less"""
 ALIKE_SHARE = 0.5
 """of what photos usually share of the points that they should: less contradicts their poses"""
+MIN_KEPT_SHARE = 0.1
+"""of the matches of two photos are points that both see, if the model shows them at one place"""
 MIN_MISSING = 60.0
 """Points that the photos of two blocks lack together, to contradict"""
 
@@ -38,7 +40,7 @@ def find_lookalikes(
         pairs: (m, 2) rows of photos that match.
         counts: (m,) matches of each pair.
     """
-    expected, common = _count_shared(component, pairs)
+    expected, common, shared = _count_shared(component, pairs)
     share = common / np.maximum(expected, 1)
     best = np.zeros(len(component.photo_ids))
     for side in pairs[expected >= MIN_EXPECTED].T:
@@ -53,25 +55,27 @@ def find_lookalikes(
             found[labels == label] = label + 1
         else:
             kept.append(label)
+    is_there = shared > MIN_KEPT_SHARE * counts
     here = np.zeros(len(best))  # most matches with a photo that the model shows there, too
     for side in pairs.T:
-        np.maximum.at(here, side, np.where(common > 0, counts, 0))
+        np.maximum.at(here, side, np.where(is_there, counts, 0))
     weaker = pairs[np.arange(len(pairs)), here[pairs].argmin(axis=1)]
-    alone = np.unique(weaker[(common == 0) & (counts > here[weaker])])
+    alone = np.unique(weaker[~is_there & (counts > here[weaker])])
     alone = alone[found[alone] == 0]
     found[alone] = len(best) + 1 + alone
     return found, excess
 
 
 def _count_shared(component: Component, pairs: Pairs) -> NDArray[np.intp]:
-    """Return (2, m): how many points two photos should see in common, and how many they do.
+    """Return (3, m): points that two photos should both see, that they do, and that they share.
 
-    Of the two, that counts which should see fewer of the other's.
+    Of the two, that counts which should see fewer of the other's. They may share points that they
+    see from different sides, too.
     """
     centres = component.centres()
     seen = [np.unique(numbers[numbers >= 0]) for numbers in component.point_numbers]
 
-    def count(one: int, other: int) -> tuple[int, int]:
+    def count(one: int, other: int) -> tuple[int, int, int]:
         rays, others = (component.points[seen[one]] - centres[row] for row in (one, other))
         lengths, other_lengths = (np.linalg.norm(each, axis=1) for each in (rays, others))
         camera = component.cameras[component.camera_numbers[other]]
@@ -82,10 +86,11 @@ def _count_shared(component: Component, pairs: Pairs) -> NDArray[np.intp]:
         pixels = camera.project(axes[is_same])
         inside = ((pixels > 0) & (pixels < (camera.width, camera.height))).all(axis=1)
         should = seen[one][is_same][inside]
-        return len(should), int(np.isin(should, seen[other]).sum())
+        shared = int(np.isin(seen[one], seen[other]).sum())
+        return len(should), int(np.isin(should, seen[other]).sum()), shared
 
     counts = [min(count(one, other), count(other, one)) for one, other in pairs.tolist()]
-    return np.array(counts, np.intp).reshape(-1, 2).T
+    return np.array(counts, np.intp).reshape(-1, 3).T
 
 
 def _cluster(count: int, pairs: Pairs, excess: Floats) -> NDArray[np.intp]:

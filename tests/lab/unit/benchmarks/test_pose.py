@@ -72,7 +72,7 @@ def test_poses_of_synthetic_scenes_are_within_their_covariance(
     measure_synthetic(report)
     measured = {figure.what: figure.measured for figure in report.figures}
     assert measured["synthetic scenes: within 3 deviations"] > 93
-    assert 50 < measured["synthetic scenes: within the radius of 68 %"] < 86
+    assert 50 < measured["synthetic scenes: within 68 %, not too many"] < 86
 
 
 def test_walks_of_a_building_are_an_hour_apart() -> None:
