@@ -59,8 +59,8 @@ class KMeansPass:
     """(K,) int64: number of points assigned to each centre."""
     sums: torch.Tensor
     """(K, D) sum of the points assigned to each centre."""
-    similarity: float
-    """Sum of the points' cosines to their centres."""
+    similarity: torch.Tensor
+    """Sum of the points' cosines to their centres: a float64 scalar, for which no GPU is awaited."""
     worst: torch.Tensor
     """(at most K, D) points farthest from their centres, farthest first."""
     worst_distances: torch.Tensor
@@ -72,7 +72,7 @@ class KMeansPass:
         return cls(
             counts=torch.zeros(len(centres), dtype=torch.int64, device=centres.device),
             sums=torch.zeros_like(centres),
-            similarity=0.0,
+            similarity=torch.zeros((), dtype=torch.float64, device=centres.device),
             worst=centres[:0],
             worst_distances=centres[:0, 0],
         )
@@ -85,7 +85,7 @@ class KMeansPass:
             self.sums += one_hot(labels, len(centres)).to(points.dtype).T @ points
         else:
             self.sums.index_add_(0, labels, points)
-        self.similarity += float(cosines.sum(dtype=torch.float64))
+        self.similarity += cosines.sum(dtype=torch.float64)
         norms = centres.norm(dim=-1)[labels]
         distances = 1 - 2 * cosines * norms + norms**2
         farthest = distances.argsort(descending=True, stable=True)[: len(centres)]

@@ -117,7 +117,7 @@ def fit_centres(
                 on_progress(clusters + passes * batches + done, total)
         moved = statistics.end(centres)
         movement = float(((moved - centres) ** 2).sum())
-        centres, passes, similarity = moved, passes + 1, statistics.similarity / count
+        centres, passes, similarity = moved, passes + 1, float(statistics.similarity) / count
         settled = passes == MINI_BATCH_PASSES + SETTLING_PASSES or (
             not is_mini_batch and movement <= TOLERANCE
         )

@@ -38,7 +38,7 @@ def test_a_pass_ends_with_plain_means_that_are_not_normalised_again() -> None:
     one = walk(points, centres, batch=2)
     assert one.end(centres).tolist() == [[0.5, 0.5], [-1.0, 0.0]]
     assert one.counts.tolist() == [2, 1]
-    assert one.similarity == pytest.approx(2 * 0.5**0.5 + 1)
+    assert float(one.similarity) == pytest.approx(2 * 0.5**0.5 + 1)
 
 
 @pytest.mark.parametrize("batch", [1, 7, 64, 1000])
