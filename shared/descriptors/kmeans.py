@@ -60,7 +60,7 @@ class KMeansPass:
     sums: torch.Tensor
     """(K, D) sum of the points assigned to each centre."""
     similarity: torch.Tensor
-    """Sum of the points' cosines to their centres: a float64 scalar, for which no GPU is awaited."""
+    """Sum of the points' cosines to their centres, a float64 scalar on the device."""
     worst: torch.Tensor
     """(at most K, D) points farthest from their centres, farthest first."""
     worst_distances: torch.Tensor
