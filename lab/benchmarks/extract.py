@@ -232,7 +232,7 @@ def _count_flops(made: Extractor, photo: Pixels) -> float:
     """Count the backbone's floating-point operations per photo; a multiply-add counts as two."""
     # Fused attention is not counted on every device; written out, it always is.
     with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
-        made.features(photo[None])
+        made.features(np.stack([photo]))
     return float(counter.get_total_flops())
 
 
