@@ -164,7 +164,7 @@ def _squeeze(
     resampling: Image.Resampling = Image.Resampling.BILINEAR,
 ) -> Pixels:
     """Resize ignoring the aspect ratio: antialiased when shrinking, rounded."""
-    return np.asarray(image.resize((width, height), resampling))
+    return np.array(image.resize((width, height), resampling))  # writable, as PyTorch wants it
 
 
 def _fit_area(image: Image.Image, height: int, width: int) -> Pixels:
