@@ -41,6 +41,7 @@ from services.gateway.routes import (
     uploads,
     webhooks,
 )
+from services.gateway.similarity.geopose import MAX_GEOPOSE_BYTES
 from services.gateway.web_page import add_web_page
 from services.request_log import RequestLogMiddleware
 from shared.http.problem_details import (
@@ -112,7 +113,7 @@ def create_app(gateway: GatewayContext) -> FastAPI:
         limits={
             f"{API_PREFIX}{positions.POSITIONS_PATH}": positions.MAX_BODY_BYTES,
             f"{API_PREFIX}{reconstructions.IMPORT_PATH}": reconstructions.MAX_MODEL_BYTES,
-            f"{API_PREFIX}{similarity.GEOPOSE_PATH}": similarity.MAX_GEOPOSE_BYTES,
+            f"{API_PREFIX}{similarity.GEOPOSE_PATH}": MAX_GEOPOSE_BYTES,
         },
     )
     app.add_middleware(RateLimitMiddleware, limiter=app.state.rate_limiter)

@@ -63,8 +63,6 @@ from shared.storage.keys import query_key, query_preview_key
 router = APIRouter(tags=["similarity"], route_class=JsonRoute)
 
 GEOPOSE_PATH = "/geopose"
-MAX_GEOPOSE_BYTES = 8_000_000
-"""Of a request with a photo in base64, which takes a third more than the photo"""
 GEOPOSE_WAIT_SECONDS = 30.0
 """Without `Prefer: wait=N`; its clients know no jobs"""
 

@@ -30,6 +30,9 @@ from shared.search_api.photo_filter import Circle
 
 MEDIA_TYPE = "application/geopose+json"
 JSON_TYPE = "application/json"
+MAX_GEOPOSE_BYTES = 8_000_000
+"""Of a request with a photo in base64, which takes a third more than the photo"""
+MAX_READINGS = 64
 MIN_HINT_RADIUS_M = 100.0
 """Clients that do not know the accuracy of a position send 0"""
 HINT_ACCURACIES = 2.0
@@ -115,12 +118,14 @@ class CameraParameters(_Sent):
 
 
 class CameraReading(_Sent):
-    image_bytes: str = Field(description="the photo as a file, in base64")
+    image_bytes: str = Field(
+        max_length=MAX_GEOPOSE_BYTES, description="the photo as a file, in base64"
+    )
     size: tuple[Side, Side] | None = Field(
         None, description="width and height that the camera's parameters refer to"
     )
     image_orientation: dict[str, float] | None = Field(
-        None, description="`mirrored` and `rotation`: 0"
+        None, max_length=MAX_READINGS, description="`mirrored` and `rotation`: 0"
     )
     params: CameraParameters | None = None
 
@@ -134,9 +139,11 @@ class GeolocationReading(_Sent):
 class SensorReadings(_Sent):
     """Only the first reading of each kind is used."""
 
-    camera_readings: list[CameraReading] = Field(min_length=1)
+    camera_readings: list[CameraReading] = Field(min_length=1, max_length=MAX_READINGS)
     geolocation_readings: list[GeolocationReading] = Field(
-        [], description="where to look first; other places are not excluded"
+        [],
+        max_length=MAX_READINGS,
+        description="where to look first; other places are not excluded",
     )
 
 
@@ -148,7 +155,7 @@ class GeoPoseRequest(_Sent):
     """A request of the GeoPoseProtocol, version 1 or 2."""
 
     id: str = Field("", max_length=MAX_TEXT_CHARACTERS)
-    timestamp: float | str | None = None
+    timestamp: float | Annotated[str, Field(max_length=MAX_TEXT_CHARACTERS)] | None = None
     sensor_readings: SensorReadings
 
     @model_validator(mode="before")
