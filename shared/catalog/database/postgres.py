@@ -33,6 +33,7 @@ PING_AFTER_UNUSED_SECONDS = 1.0
 DEFAULT_PORT = 5432
 BEGIN_SNAPSHOT = "BEGIN ISOLATION LEVEL REPEATABLE READ, READ ONLY"
 USED_AT = "placewise_used_at"  # of a pooled connection: when it was returned, in monotonic seconds
+POOL = "placewise_pool"  # of a pooled connection: the pool that made it
 
 # Detects a peer that disappeared without closing the connection (lost network or machine).
 TCP_KEEPALIVE_OPTIONS = {
@@ -77,7 +78,20 @@ def make_postgres_engine(url: URL, pool: PoolConfig) -> Engine:
         creator=_connector(url, pool),
     )
     event.listen(engine, "begin", _begin)
-    event.listen(engine, "checkin", _on_checkin)
+
+    def note_pool(_connection: object, record: ConnectionPoolEntry) -> None:
+        record.info[POOL] = engine.pool
+
+    def check_in(connection: TimeoutConnection | None, record: ConnectionPoolEntry) -> None:
+        if connection is None:  # it was invalidated
+            return
+        connection.answer_seconds = PING_TIMEOUT_SECONDS
+        record.info[USED_AT] = time.monotonic()
+        if record.info[POOL] is not engine.pool:  # in use while the engine was disposed of
+            record.close()
+
+    event.listen(engine, "connect", note_pool)
+    event.listen(engine, "checkin", check_in)
 
     def ping(connection: Any, record: ConnectionPoolEntry, _proxy: object) -> None:
         """Replace all connections if this one, which was not used for a while, is dead."""
@@ -130,9 +144,3 @@ def _begin(connection: Connection) -> None:
     driver.answer_seconds = None
     if limits is not None and limits.statement_seconds:
         driver.answer_seconds = limits.statement_seconds + ANSWER_MARGIN_SECONDS
-
-
-def _on_checkin(connection: TimeoutConnection | None, record: ConnectionPoolEntry) -> None:
-    if connection is not None:  # None: the connection was invalidated
-        connection.answer_seconds = PING_TIMEOUT_SECONDS
-        record.info[USED_AT] = time.monotonic()

@@ -193,3 +193,14 @@ def test_no_free_connection_is_an_error_within_the_configured_wait(catalog: Cata
     error = to_unavailable(caught.value)
     assert error is not None
     assert error.code == "catalog_busy"
+
+
+def test_connection_in_use_while_the_catalog_closes_is_closed_when_it_is_returned(
+    catalog: Catalog,
+) -> None:
+    with catalog.read() as session:
+        driver = session.connection().connection.driver_connection
+        catalog.close()
+        assert session.scalar(select(1)) == 1
+    assert driver is not None
+    assert driver.closed
