@@ -12,9 +12,9 @@ from uuid import UUID
 import httpx2
 import psutil
 
-from lab.benchmarks.invariants import check_invariants, count_unfinished_jobs
 from shared.catalog.database.session import Catalog
 from shared.storage import FolderStore
+from tests.support.invariants import count_unfinished_jobs, find_violations
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess
 from tests.support.servers.daemon import has_ended
@@ -86,8 +86,7 @@ def test_after_five_kills_every_acknowledged_photo_is_searchable_exactly_once(
             hashlib.sha256(photo_bytes(number)).hexdigest(): UUID(file_id)
             for number, file_id in uploader.acknowledged.items()
         }
-        counts = check_invariants(catalog, FolderStore(server.home / "objects"), expected)
-        assert counts.none_found, counts
+        assert not find_violations(catalog, FolderStore(server.home / "objects"), expected)
         catalog.close()
         assert_each_finds_itself(server, uploader.acknowledged)
 
