@@ -20,6 +20,8 @@ from tests.integration.harness import Harness, expected_row, same
 from tests.support.catalog_rows import problem_of, set_columns
 from tests.support.photos import photo_bytes
 
+pytestmark = pytest.mark.databases("postgresql")
+
 WAIT_SECONDS = 90.0
 BATCH = 4  # tests.integration.conftest
 

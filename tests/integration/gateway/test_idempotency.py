@@ -28,6 +28,8 @@ from tests.integration.in_process_api import Service
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import field_refused, problem
 
+pytestmark = pytest.mark.databases("postgresql")
+
 REPLAYED = "idempotent-replayed"
 
 
