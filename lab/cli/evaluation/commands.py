@@ -343,9 +343,6 @@ def compare(
     ] = None,
     protocol: ProtocolOption = None,
     rule: RuleOption = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Output folder for comparison.json and report.html.")
-    ] = None,
     faiss_gpu: FaissGpuOption = False,
     extractor: Annotated[
         list[str] | None,
@@ -390,7 +387,6 @@ def compare(
         set_name=set_name,
         protocol=protocol,
         rule=rule,
-        out=out,
         faiss_gpu=faiss_gpu,
         as_json=as_json,
     )

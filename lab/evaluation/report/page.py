@@ -1,4 +1,4 @@
-"""Renders the HTML reports of evaluations and comparisons from the folder `templates`.
+"""Renders the HTML reports of evaluations from the folder `templates`.
 
 A report is one file: its charts and photos are inside, and it fetches nothing.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
@@ -37,8 +36,7 @@ def render_report(
         grids_shown: maximum number of queries per retrieval grid.
         only_wrong: omit the grid of correct queries.
     """
-    return render_page(
-        "evaluation.html",
+    return _templates.get_template("evaluation.html").render(
         title=f"Evaluation of {run.name}",
         about={"model": run.name, "fingerprint": run.fingerprint or "unknown", **run.about},
         versions=", ".join(f"{name} {number}" for name, number in package_versions().items()),
@@ -54,11 +52,6 @@ def render_report(
             for result in results
         ],
     )
-
-
-def render_page(template: str, **values: Any) -> str:
-    """Render a page of the folder `templates`."""
-    return _templates.get_template(template).render(**values)
 
 
 def _format_share(

@@ -320,21 +320,15 @@ def test_people_are_shown_a_table(city: Path) -> None:
 
 
 def test_descriptors_are_compared_by_recall_time_and_size_and_described_once(
-    city: Path, tmp_path: Path, checkpoint: Path
+    city: Path, checkpoint: Path
 ) -> None:
     vlad = "test-tiny-vlad:clusters=3,preprocessing=demo1024+fit+pca4"
     extractors = f"test-tiny-avg,{vlad},{checkpoint}"
-    report = run_json("compare", city, "--extractors", extractors, "--out", tmp_path / "out")
+    report = run_json("compare", city, "--extractors", extractors)
     sizes = [one["bytes_a_photo"] for one in report["extractors"]]
     assert sizes == [16 * 2, 4 * 2, 128 * 2]
     assert all(one["milliseconds_a_photo"] > 0 for one in report["extractors"])
     assert report["extractors"][0]["against_first"] is None
-    assert report["extractors"][1]["pareto_by_size"], "nothing is smaller"
-    page = (tmp_path / "out" / "report.html").read_text()
-    charts = charts_of(page)
-    assert [title for title, _ in charts] == ["Recall and size", "Recall and time"]
-    for one in report["extractors"]:
-        assert one["extractor"] in "".join(charts[0][1].itertext())
     again = run_json("compare", city, "--extractors", extractors)
     for before, after in zip(report["extractors"], again["extractors"], strict=True):
         assert after["recall"] == before["recall"]
