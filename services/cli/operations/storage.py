@@ -1,7 +1,7 @@
 """`placewise storage`: the catalog and the object store.
 
 `verify` checks every chunk against its hash and the catalog. Other subcommands create tables and
-the bucket, assign the store to a catalog, and manage orphaned objects and the trash.
+the bucket, and manage orphaned objects and the trash.
 """
 
 from __future__ import annotations
