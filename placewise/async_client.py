@@ -119,7 +119,7 @@ class AsyncClient(AsyncTransport):
     async def similar(
         self,
         /,
-        photo: str | Path | answers.Photo | UUID,
+        photo: str | Path | BinaryIO | answers.Photo | UUID,
         top_k: int = 10,
         min_score: float | None = None,
         matches: int | None = None,
@@ -133,7 +133,8 @@ class AsyncClient(AsyncTransport):
         """Find the most similar photos and estimate the place.
 
         Args:
-            photo: A file, which is not stored, or a stored photo (a Photo or its UUID).
+            photo: A file (its path, or open for reading bytes), which is not stored, or a stored
+                photo (a Photo or its UUID).
             top_k: Maximum number of results.
             min_score: Minimum cosine similarity.
             matches: Number of first results whose local features are matched with the photo's, 0 to
@@ -168,7 +169,8 @@ class AsyncClient(AsyncTransport):
             file_id = photo.image_id if isinstance(photo, answers.Photo) else photo
             answer = await self._call("POST", f"/similarity/{file_id}", **options)
         else:
-            answer = await self._send_file("/similarity", Path(photo), **options)
+            file = Path(photo) if isinstance(photo, (str, Path)) else photo
+            answer = await self._send_file("/similarity", file, **options)
         if "result_url" in answer:
             async for _ in self.watch(answer["job_id"]):
                 pass

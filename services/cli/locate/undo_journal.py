@@ -16,28 +16,18 @@ import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 
+from services.cli.locate.library import UndoReport
 from services.cli.output import printable_path
 from shared.errors import Conflict, Misconfigured, NotFound, Unprocessable
 from shared.ids import new_id
 
 FOLDER = ".placewise-locate"
 JOURNAL, BACKUPS, STAGED = "journal.jsonl", "before", "new"
-
-
-@dataclass(frozen=True, slots=True)
-class UndoReport:
-    """What `undo` has done; paths are relative to the folder."""
-
-    restored: list[str]
-    removed: list[str]
-    changed_since: list[str]
-    """files that something else has changed since; they are left as they are"""
 
 
 class UndoJournal:
@@ -132,7 +122,7 @@ def undo(root: Path) -> UndoReport:
     folder = root / FOLDER
     if not (folder / JOURNAL).exists():
         raise NotFound("nothing_to_undo", f"{printable_path(root)} has no journal of changes.")
-    report = UndoReport([], [], [])
+    report = UndoReport()
     with _exclusive(root):
         originals: dict[str, dict[str, Any]] = {}
         written: dict[str, set[str]] = {}
