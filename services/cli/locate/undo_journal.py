@@ -14,15 +14,14 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 from filelock import FileLock, Timeout
 
 from services.cli.locate.library import UndoReport
-from services.cli.output import printable_path
+from services.cli.output import Json, printable_path
 from shared.errors import Conflict, Misconfigured, NotFound, Unprocessable
 from shared.ids import new_id
 
@@ -83,15 +82,12 @@ class UndoJournal:
             line["backup"] = str(new_id())  # a name that no earlier backup has
             _link_or_copy(path, self._folder / BACKUPS / str(line["backup"]))
             _sync(self._folder / BACKUPS)
-        with self._journal.open("ab") as file:
-            file.write(_to_line(line))
-            file.flush()
-            os.fsync(file.fileno())
+        append_to_journal(self._journal, line)
         self._remember(line)
         staged.replace(path)
         _sync(path.parent)
 
-    def _remember(self, line: dict[str, Any]) -> None:
+    def _remember(self, line: Json) -> None:
         self._known.setdefault(line["path"], set()).update((line["before"], line["after"]))
 
 
@@ -124,7 +120,7 @@ def undo(root: Path) -> UndoReport:
         raise NotFound("nothing_to_undo", f"{printable_path(root)} has no journal of changes.")
     report = UndoReport()
     with _exclusive(root):
-        originals: dict[str, dict[str, Any]] = {}
+        originals: dict[str, Json] = {}
         written: dict[str, set[str]] = {}
         for line in _read_lines(folder / JOURNAL):
             if line["backup"] is not None:
@@ -178,22 +174,49 @@ def _exclusive(root: Path) -> Iterator[None]:
         ) from error
 
 
-def _read_lines(journal: Path) -> list[dict[str, Any]]:
-    """Return the lines of a journal; an incomplete last line stands for no change."""
+def _read_lines(journal: Path) -> list[Json]:
+    return [
+        {key: line[key] for key in ("path", "before", "after", "backup")}
+        for line in read_journal(journal, _check_line)
+    ]
+
+
+def _check_line(line: Json) -> None:
+    paths = [line["path"], *([line["backup"]] if line["backup"] is not None else [])]
+    if not all(isinstance(path, str) for path in paths) or "/" in "".join(paths[1:]):
+        raise ValueError
+    _ = line["before"], line["after"]
+
+
+def read_journal(journal: Path, check: Callable[[Json], object]) -> list[Json]:
+    """Return the lines of a journal; an incomplete last line stands for no change.
+
+    Args:
+        check: Raises ValueError, KeyError or TypeError for a line of another form.
+
+    Raises:
+        Unprocessable: `journal_damaged`.
+    """
     data = journal.read_bytes() if journal.exists() else b""
-    lines = []
+    lines: list[Json] = []
     for number, text in enumerate(data.split(b"\n")[:-1], start=1):
         try:
             line = json.loads(text)
-            paths = [line["path"], *([line["backup"]] if line["backup"] is not None else [])]
-            if not all(isinstance(path, str) for path in paths) or "/" in "".join(paths[1:]):
-                raise ValueError
-            lines.append({key: line[key] for key in ("path", "before", "after", "backup")})
+            check(line)
         except (ValueError, KeyError, TypeError) as error:
             raise Unprocessable(
                 "journal_damaged", f"{printable_path(journal)}: line {number} can't be read."
             ) from error
+        lines.append(line)
     return lines
+
+
+def append_to_journal(journal: Path, line: Json) -> None:
+    """Append a line, which is on the disk when the call returns."""
+    with journal.open("ab") as file:
+        file.write(_to_line(line))
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _check_is_below(root: Path, name: str) -> None:
@@ -206,7 +229,7 @@ def _check_is_below(root: Path, name: str) -> None:
         )
 
 
-def _to_line(line: dict[str, Any]) -> bytes:
+def _to_line(line: Json) -> bytes:
     # File names that are no UTF-8 are read back as they were.
     return json.dumps(line).encode() + b"\n"
 
