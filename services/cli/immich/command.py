@@ -33,12 +33,14 @@ from services.cli.output import (
     TimeZoneOption,
     print_failures,
     print_note,
+    printable_text,
     progress_bar,
 )
 from shared.config.command_line import command_line
 from shared.errors import Misconfigured
 
 KEY_VARIABLE = "IMMICH_API_KEY"
+SHOWN = 3  # names of photos
 
 
 def immich(
@@ -88,13 +90,16 @@ def immich(
         journals = read_settings().placewise_home / "immich"
         library = ImmichLibrary(api, journals, time_zone, clock_offset)
         if undo_changes:
-            report = library.undo()
-            if report.removed:
-                print_note(
-                    f"{len(report.removed)} photos had no coordinates before. Immich's API can't "
-                    "take coordinates away, so they have 0, 0 now, which is no place for Placewise."
+            undone = library.undo()
+            message = f"{len(undone.restored)} photos have the coordinates of before again."
+            if undone.removed:
+                message += (
+                    f" {len(undone.removed)} photos had none. Immich's API can't take coordinates "
+                    "away, so they have 0, 0 now, which Placewise takes for no place: "
+                    f"{', '.join(map(printable_text, undone.removed[:SHOWN]))}"
+                    + (" ..." if len(undone.removed) > SHOWN else "")
                 )
-            report_undo(report, "photos", as_json)
+            report_undo(undone, message, as_json)
             return
         client = stack.enter_context(connect(server, map_name, key))
         print_note(

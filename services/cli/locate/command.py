@@ -92,7 +92,9 @@ def locate(
     """
     library = FolderLibrary(folder, write or Target.SIDECAR, time_zone, clock_offset)
     if undo_changes:
-        report_undo(library.undo(), "files", as_json)
+        undone = library.undo()
+        message = f"{len(undone.restored)} files restored, {len(undone.removed)} removed."
+        report_undo(undone, message, as_json)
         return
     options = LocateOptions(accept, radius, motion, together, gpx, picture, server, map_name)
     open_client = partial(connect, server, map_name, key)

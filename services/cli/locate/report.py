@@ -161,16 +161,12 @@ def _print_proposals(found: LocatedLibrary, accept: float, words: LibraryWords) 
         err_console.print(line, soft_wrap=True)
 
 
-def report_undo(report: UndoReport, written: str, as_json: bool) -> None:
-    """Print what was undone; exits with 1 if something was left as it is.
-
-    Args:
-        written: What was written, in the plural, such as "files".
-    """
+def report_undo(report: UndoReport, message: str, as_json: bool) -> None:
+    """Print what was undone; exits with 1 if something was left as it is."""
     if as_json:
         print_json(asdict(report))
     else:
-        print_note(f"{len(report.restored)} {written} restored, {len(report.removed)} removed.")
+        print_note(message)
         for name in report.changed_since:
             err_console.print(
                 f"[red]changed since[/red] {escape(printable_text(name))}: left as it is",
