@@ -6,6 +6,7 @@ are needed have been the same from 1.135 to 3.2.2 (the OpenAPI descriptions of `
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from collections.abc import Iterator, Sequence
@@ -29,23 +30,18 @@ RETRY_PERIOD_SECONDS = 60.0
 PAGE_SIZE = 1000  # the most that Immich returns
 WRITE_INTERVAL_SECONDS = 0.1
 """Between two writes: each makes Immich write a sidecar and look up the name of the place"""
+HINTS: dict[int, tuple[type[PlacewiseError], str]] = {
+    401: (Unauthorized, "Check IMMICH_API_KEY."),
+    403: (Forbidden, "Add it to the API key."),
+}
 Coordinates = tuple[float, float]
 
 
 class ImmichApi:
-    """Client of one Immich server as one user. Close it, or use it as a context manager.
+    """Calls one Immich server as one user; busy or unavailable, it is called again for a minute.
 
-    Calls are retried for RETRY_PERIOD_SECONDS while the server is unavailable, and as its
-    `Retry-After` says while it is busy.
-
-    Raises, in all calls:
-        InvalidRequest: `bad_address`, `bad_key`.
-        Unauthorized: `immich_key_refused`.
-        Forbidden: `immich_permission_missing`.
-        Unavailable: `immich_unavailable`.
-        TooManyRequests: `immich_busy`.
-        Unprocessable: `immich_refused` for every other error, and for an answer that is not
-            Immich's.
+    Every call raises Unauthorized, Forbidden, NotFound, TooManyRequests or Unavailable as Immich
+    answers, and Unprocessable for every other error; the code is `immich_refused`.
     """
 
     def __init__(self, url: str, key: str) -> None:
@@ -113,13 +109,11 @@ class ImmichApi:
             return response.json()
         except ValueError as error:
             raise Unprocessable(
-                "immich_refused",
-                f"{method} {response.url} did not answer JSON. Is it the address of Immich?",
+                "immich_refused", f"{response.url} is not JSON. Is it the address of Immich?"
             ) from error
 
     def _call(self, method: str, path: str, **options: Any) -> httpx2.Response:
-        deadline = time.monotonic() + RETRY_PERIOD_SECONDS
-        attempt = 0
+        deadline, attempt = time.monotonic() + RETRY_PERIOD_SECONDS, 0
         while True:
             try:
                 return self._attempt(method, path, options)
@@ -133,7 +127,7 @@ class ImmichApi:
             response = self._http.request(method, path, **options)
         except httpx2.TransportError as error:
             raise Unavailable(
-                "immich_unavailable", f"Immich at {self.url} does not answer: {error}"
+                "immich_refused", f"Immich at {self.url} does not answer: {error}"
             ) from error
         if not response.is_success:
             raise _error_of(response)
@@ -143,21 +137,15 @@ class ImmichApi:
 def _error_of(response: httpx2.Response) -> PlacewiseError:
     """Convert an error of Immich, which is JSON with `message`, or of a proxy before it."""
     status, text = response.status_code, response.text[:200]
-    try:
+    with contextlib.suppress(ValueError, KeyError, TypeError):
         message = json.loads(response.text)["message"]
         text = "; ".join(message) if isinstance(message, list) else str(message)
-    except (ValueError, KeyError, TypeError):
-        pass
     said = f"Immich answers {status} to {response.request.method} {response.url.path}: {text}"
-    if status == 401:
-        return Unauthorized("immich_key_refused", f"{said}. Check IMMICH_API_KEY.")
-    if status == 403:
-        return Forbidden("immich_permission_missing", f"{said}. Add it to the API key.")
+    if status in HINTS:
+        kind, hint = HINTS[status]
+        return kind("immich_refused", f"{said}. {hint}")
     if status == 404 or (status == 400 and text.startswith("Not found or no ")):
-        return NotFound("immich_not_found", said)
+        return NotFound("immich_refused", said)
     general = response_error(response)
-    if isinstance(general, TooManyRequests):
-        return TooManyRequests("immich_busy", said, **general.extra)
-    if isinstance(general, Unavailable):
-        return Unavailable("immich_unavailable", said, **general.extra)
-    return Unprocessable("immich_refused", said)
+    retried = isinstance(general, (TooManyRequests, Unavailable))
+    return (type(general) if retried else Unprocessable)("immich_refused", said, **general.extra)

@@ -22,8 +22,8 @@ from services.cli.locate.command import (
     RadiusOption,
     TogetherOption,
 )
-from services.cli.locate.proposals import LocateOptions, locate_library
-from services.cli.locate.report import LibraryWords, report_located, report_undo
+from services.cli.locate.proposals import locate_library
+from services.cli.locate.report import LocateOptions, report_undo
 from services.cli.output import (
     Json,
     JsonOption,
@@ -110,13 +110,14 @@ def immich(
             indexed = sync_map(client, library, library.list_photos(), progress)
         if not as_json:
             _print_indexed(indexed)
-        options = LocateOptions(accept, radius, motion, together, gpx, picture, server, map_name)
-        found = locate_library(library, options, write, lambda: contextlib.nullcontext(client))
-    undo = command_line("immich", "--url", url, "--undo")
-    words = LibraryWords("photos", "--write", undo)
-    report_located(found, accept, words, as_json, indexed=indexed)
-    found.keep_searches()
-    if found.has_failures or indexed["failed"]:
+        options = LocateOptions(
+            accept, radius, motion, together, gpx, picture, server, map_name, write, as_json,
+            "--write", command_line("immich", "--url", url, "--undo"), "photos",
+        )  # fmt: skip
+        complete = locate_library(
+            library, options, lambda: contextlib.nullcontext(client), indexed=indexed
+        )
+    if indexed["failed"] or not complete:
         raise typer.Exit(1)
 
 

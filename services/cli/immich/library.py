@@ -8,21 +8,21 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from filelock import FileLock, Timeout
 
 from services.cli.immich.api import Coordinates, ImmichApi
 from services.cli.locate.folder import set_clocks
 from services.cli.locate.library import LibraryPhoto, LocatedPhoto, UndoReport, WriteReport
-from services.cli.locate.undo_journal import append_to_journal, read_journal
+from services.cli.locate.undo_journal import append_to_journal, read_journal, repair_journal
 from services.cli.output import Json
 from shared.config.private_files import make_private_folder
 from shared.errors import Conflict, Forbidden, NotFound, Unprocessable
 from shared.imaging.capture_place import is_null_island
 
 NOWHERE: Coordinates = (0.0, 0.0)
-"""What takes the place of coordinates that can't be taken away: no place, also for Immich"""
+"""In place of coordinates that can't be taken away: no place, also when Immich reads metadata"""
 SAME_DEGREES = 1e-6
 """Immich stores coordinates in a sidecar, too, where they are rounded"""
 
@@ -88,92 +88,76 @@ class ImmichLibrary:
                 continue
             position = (each.proposal.latitude, each.proposal.longitude)
             same_position.setdefault(position, []).append(each.photo)
-        with self._exclusive():
+        with self._open_journal():
             for position, photos in same_position.items():
-                unchanged = []
+                names = {}
                 for photo in photos:
                     asset = self._api.asset(photo.id)
                     if asset is None or asset["isTrashed"]:
                         report.skipped[photo.name] = "was deleted meanwhile"
-                    elif _coordinates(asset):
+                    elif _place(former := _coordinates(asset)):
                         report.skipped[photo.name] = "got coordinates meanwhile"
                     else:
-                        unchanged.append(photo)
-                        self._record(photo, _stored_pair(asset), position)
-                if not unchanged:
-                    continue
+                        names[photo.id] = photo.name
+                        line = {"id": photo.id, "name": photo.name, "before": former}
+                        append_to_journal(self._journal, {**line, "after": position})
                 try:
-                    self._api.set_coordinates([photo.id for photo in unchanged], position)
+                    if names:
+                        self._api.set_coordinates(list(names), position)
                 except (NotFound, Unprocessable, Forbidden) as error:
-                    report.skipped.update({photo.name: error.detail for photo in unchanged})
+                    report.skipped.update(dict.fromkeys(names.values(), error.detail))
                 else:
-                    report.written.extend(photo.name for photo in unchanged)
+                    report.written.extend(names.values())
         return report
 
     def undo(self) -> UndoReport:
-        """Restore the coordinates; images that had none get 0, 0, which Immich takes for none."""
+        """Restore the coordinates; images that had none get 0, 0, which are no place."""
         report = UndoReport()
         if not self._journal.exists():
             raise NotFound("nothing_to_undo", "Nothing was written into this library.")
-        with self._exclusive():
-            lines = read_journal(self._journal, _check_line)
-            written: dict[str, list[Json]] = {}
+        with self._open_journal() as lines:
+            changes: dict[str, list[Json]] = {}
             for line in lines:
-                written.setdefault(line["id"], []).append(line)
-            for asset_id, changes in written.items():
+                changes.setdefault(line["id"], []).append(line)
+            for asset_id, (first, *later) in changes.items():
                 asset = self._api.asset(asset_id)
-                if asset is None:
-                    continue  # deleted: there is nothing to restore
-                name, before = changes[0]["name"], _pair(changes[0]["before"])
-                present = _coordinates(asset)
-                if _is_same(present, _place(before)):
+                present = asset and _place(_coordinates(asset))
+                if not present:
+                    continue  # deleted, or without a place, as it was
+                if not any(_is_same(present, line["after"]) for line in (first, *later)):
+                    report.changed_since.append(first["name"])
                     continue
-                if not any(_is_same(present, _pair(line["after"])) for line in changes):
-                    report.changed_since.append(name)
-                    continue
-                self._api.set_coordinates([asset_id], before or NOWHERE)
-                (report.restored if before else report.removed).append(name)
+                self._api.set_coordinates([asset_id], first["before"] or NOWHERE)
+                (report.restored if first["before"] else report.removed).append(first["name"])
             if not report.changed_since:
                 self._journal.unlink()
         return report
 
-    def _record(self, photo: LibraryPhoto, before: Coordinates | None, after: Coordinates) -> None:
-        line = {"id": photo.id, "name": photo.name, "before": before, "after": after}
-        append_to_journal(self._journal, line)
-
     @contextlib.contextmanager
-    def _exclusive(self) -> Iterator[None]:
+    def _open_journal(self) -> Iterator[list[Json]]:
         make_private_folder(self._journal.parent)
         try:
             with FileLock(self._journal.with_suffix(".lock"), timeout=0):
-                self._end_last_line()
-                yield
+                lines = read_journal(self._journal, _check_line)
+                repair_journal(self._journal, lines)
+                yield lines
         except Timeout as error:
             raise Conflict(
                 "locate_in_progress", "Another `placewise immich` writes to this library."
             ) from error
 
-    def _end_last_line(self) -> None:
-        """Take away an incomplete last line, which a killed process has left."""
-        if self._journal.exists():
-            complete, _, rest = self._journal.read_bytes().rpartition(b"\n")
-            if rest:
-                with self._journal.open("r+b") as file:
-                    file.truncate(len(complete) + 1 if complete else 0)
-
 
 def _library_photo(image: Json, album: str) -> LibraryPhoto:
     """Return what Immich says about when, where and by which camera an image was taken."""
     exif = image.get("exifInfo") or {}
-    clock, taken = _time(image["localDateTime"]), None
+    clock = _time(image["localDateTime"])  # as the camera showed it
+    taken = clock if exif.get("dateTimeOriginal") else None
     offset = None
-    if exif.get("dateTimeOriginal"):
-        taken = clock  # as the camera showed it
-        if exif.get("timeZone"):
-            taken = _time(exif["dateTimeOriginal"])
-            offset = clock - taken
+    if taken and exif.get("timeZone"):
+        taken = _time(exif["dateTimeOriginal"])
+        offset = clock - taken
     picture = [image["checksum"], *([image["thumbhash"]] if image.get("isEdited") else [])]
-    latitude, longitude = _coordinates(image) or (None, None)
+    latitude, longitude = _place(_coordinates(image)) or (None, None)
     return LibraryPhoto(
         f"{album}/{image['originalFileName']}" if album else image["originalFileName"],
         taken,
@@ -188,39 +172,26 @@ def _library_photo(image: Json, album: str) -> LibraryPhoto:
 
 
 def _time(text: str) -> datetime:
-    time = datetime.fromisoformat(text)
-    return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
-
-
-def _stored_pair(asset: Json) -> Coordinates | None:
-    exif = asset.get("exifInfo") or {}
-    return _pair((exif.get("latitude"), exif.get("longitude")))
+    return datetime.fromisoformat(text).replace(tzinfo=UTC)  # Immich writes all times in UTC
 
 
 def _coordinates(asset: Json) -> Coordinates | None:
-    return _place(_stored_pair(asset))
+    exif = asset.get("exifInfo") or {}
+    latitude, longitude = exif.get("latitude"), exif.get("longitude")
+    return None if latitude is None or longitude is None else (latitude, longitude)
 
 
-def _place(pair: Coordinates | None) -> Coordinates | None:
+def _place(coordinates: Coordinates | None) -> Coordinates | None:
     """Return the coordinates; 0, 0 are none."""
-    return None if pair is None or is_null_island(*pair) else pair
+    return None if coordinates is None or is_null_island(*coordinates) else coordinates
 
 
-def _is_same(one: Coordinates | None, other: Coordinates | None) -> bool:
-    if one is None or other is None:
-        return one is other
+def _is_same(one: Coordinates, other: Coordinates) -> bool:
     return all(abs(a - b) <= SAME_DEGREES for a, b in zip(one, other, strict=True))
 
 
-def _pair(value: Any) -> Coordinates | None:
-    if value is None or None in value:
-        return None
-    latitude, longitude = value
-    return float(latitude), float(longitude)
-
-
 def _check_line(line: Json) -> None:
+    for latitude, longitude in (line["before"] or NOWHERE, line["after"]):
+        _ = float(latitude), float(longitude)
     if not isinstance(line["id"], str) or not isinstance(line["name"], str):
         raise TypeError
-    _pair(line["before"])
-    _pair(line["after"])

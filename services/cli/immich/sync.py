@@ -6,11 +6,13 @@ What the map has of the library is in the map itself: each photo has the library
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from rich.progress import Progress
 
@@ -19,11 +21,9 @@ from placewise.client import Client
 from services.cli.ingest.geotags import LocalPhoto
 from services.cli.ingest.upload import upload_photos
 from services.cli.locate.library import LibraryPhoto, PhotoLibrary
-from services.cli.output import Json
+from services.cli.output import Json, utf8_path
 from shared.errors import NotFound
 from shared.ingest.photo_metadata import parse_relative_path
-
-DEGREES = 7  # digits after the point
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,81 +52,55 @@ def sync_map(
         `searchable`, and the photos that `failed`, with reasons.
     """
     located = {photo.id: photo for photo in photos if photo.latitude is not None}
-    stored = {
-        str(each.metadata["library_id"]): each
+    stored: dict[str, Photo] = {
+        each.metadata["library_id"]: each
         for each in client.photos(tags=library.identity)
         if "library_id" in each.metadata
     }
-    outdated = [
-        each
-        for photo_id, each in stored.items()
-        if photo_id in located and each.metadata["library_state"] != located[photo_id].state
-    ]
-    unlisted = stored.keys() - located.keys()
-    if unlisted - {photo.id for photo in photos}:  # a listing may miss what others move meanwhile
-        listed = {p.id for p in library.list_photos() if p.latitude is not None}
-        unlisted -= listed
-    for photo_id in unlisted:
-        _delete(client, stored[photo_id])
+    gone = stored.keys() - located.keys()
+    if gone - {photo.id for photo in photos}:  # a listing may miss what others move meanwhile
+        gone -= {photo.id for photo in library.list_photos() if photo.latitude is not None}
     changed = 0
-    for photo_id in stored.keys() & located.keys():
-        there, fields = stored[photo_id], _fields(located[photo_id])
-        if _stored_fields(there) != fields:
+    uploads: dict[str, LocalPhoto] = {}
+    for photo_id, photo in located.items():
+        there, fields = stored.get(photo_id), _fields(photo)
+        if there is None or there.metadata["library_state"] != photo.state:
+            uploads[photo_id] = _upload(library, photo, fields)
+        elif fields != {name: _as_json(getattr(there, name)) for name in fields}:
             client.patch_photo(there.image_id, **fields)
             changed += 1
-    current = stored.keys() - {str(each.metadata["library_id"]) for each in outdated}
-    uploads: list[LocalPhoto] = [
-        _upload(library, photo) for photo_id, photo in located.items() if photo_id not in current
-    ]
-    report = upload_photos(client, uploads, progress)
+    report = upload_photos(client, list(uploads.values()), progress)
     failed = report["refused"] + report["failed"]
-    not_replaced = {each["path"] for each in failed}
-    for each in outdated:
-        if located[str(each.metadata["library_id"])].name not in not_replaced:
-            _delete(client, each)
+    kept = {each["path"] for each in failed}
+    replaced = {key for key, each in uploads.items() if utf8_path(each.path) not in kept}
+    for photo_id in gone | (replaced & stored.keys()):
+        with contextlib.suppress(NotFound):  # somebody else was faster
+            client.delete_photo(stored[photo_id].image_id)
     return {
         "with_coordinates": len(located),
-        "indexed": len(uploads) - len(failed),
+        "indexed": len(replaced),
         "changed": changed,
-        "removed": len(unlisted),
+        "removed": len(gone),
         "searchable": client.stats().searchable_images,
         "failed": failed,
     }
 
 
-def _upload(library: PhotoLibrary, photo: LibraryPhoto) -> _LibraryUpload:
-    metadata = {"library_id": photo.id, "library_state": photo.state}
-    fields = {name: str(value) for name, value in _fields(photo).items() if value is not None}
-    return _LibraryUpload(
-        path=Path(photo.name),
-        fields={**fields, "tags": library.identity, "metadata": json.dumps(metadata)},
-        library=library,
-        photo=photo,
-    )
+def _upload(library: PhotoLibrary, photo: LibraryPhoto, fields: Json) -> LocalPhoto:
+    metadata = json.dumps({"library_id": photo.id, "library_state": photo.state})
+    form = {name: str(value) for name, value in fields.items() if value is not None}
+    form |= {"tags": library.identity, "metadata": metadata}
+    return _LibraryUpload(Path(photo.name), form, library=library, photo=photo)
 
 
 def _fields(photo: LibraryPhoto) -> Json:
-    assert photo.latitude is not None
-    assert photo.longitude is not None
     return {
-        "latitude": round(photo.latitude, DEGREES),
-        "longitude": round(photo.longitude, DEGREES),
-        "captured_at": None if photo.time is None else photo.time.isoformat(),
+        "latitude": photo.latitude,
+        "longitude": photo.longitude,
+        "captured_at": _as_json(photo.time),
         "relative_path": parse_relative_path(photo.name),
     }
 
 
-def _stored_fields(photo: Photo) -> Json:
-    return {
-        "latitude": photo.latitude,
-        "longitude": photo.longitude,
-        "captured_at": None if photo.captured_at is None else photo.captured_at.isoformat(),
-        "relative_path": photo.relative_path,
-    }
-
-
-def _delete(client: Client, photo: Photo) -> None:
-    try:
-        client.delete_photo(photo.image_id)
-    except NotFound:  # somebody else was faster
-        return
+def _as_json(value: Any) -> Any:
+    return value.isoformat() if isinstance(value, datetime) else value

@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from services.cli.client import connect
-from services.cli.locate.proposals import LocateOptions, locate_library
-from services.cli.locate.report import LibraryWords, report_located, report_undo
+from services.cli.locate.proposals import locate_library
+from services.cli.locate.report import LocateOptions, report_undo
 from services.cli.locate.writers import FolderLibrary, Target
 from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption, TimeZoneOption
 from shared.config.command_line import command_line
@@ -96,13 +96,9 @@ def locate(
         message = f"{len(undone.restored)} files restored, {len(undone.removed)} removed."
         report_undo(undone, message, as_json)
         return
-    options = LocateOptions(accept, radius, motion, together, gpx, picture, server, map_name)
-    open_client = partial(connect, server, map_name, key)
-    found = locate_library(library, options, write is not None, open_client)
-    words = LibraryWords(
-        "files", "--write sidecar, exif, csv or gpx", command_line("locate", folder, "--undo")
-    )
-    report_located(found, accept, words, as_json)
-    found.keep_searches()
-    if found.has_failures:
+    options = LocateOptions(
+        accept, radius, motion, together, gpx, picture, server, map_name, bool(write), as_json,
+        "--write sidecar, exif, csv or gpx", command_line("locate", folder, "--undo"), "files",
+    )  # fmt: skip
+    if not locate_library(library, options, partial(connect, server, map_name, key)):
         raise typer.Exit(1)

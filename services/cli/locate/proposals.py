@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
-from pathlib import Path
 
 from placewise.answers import CameraPose, Similar
 from placewise.client import Client
 from services.cli.environment import read_settings
 from services.cli.locate.folder import check_time_zones, read_gpx
-from services.cli.locate.library import LibraryPhoto, LocatedPhoto, PhotoLibrary, WriteReport
+from services.cli.locate.library import LibraryPhoto, LocatedPhoto, PhotoLibrary
 from services.cli.locate.preview import (
     Preview,
     SearchedPhoto,
@@ -22,7 +21,8 @@ from services.cli.locate.preview import (
     read_preview,
     write_preview,
 )
-from services.cli.output import progress_bar
+from services.cli.locate.report import LocateOptions, print_changes, print_proposals, to_json
+from services.cli.output import Json, print_json, progress_bar
 from shared.errors import PlacewiseError
 from shared.geotagging.evidence import (
     KnownPosition,
@@ -41,54 +41,18 @@ SEARCHES_AT_ONCE = 4
 WITH_COORDINATES = "-90,-180,90,180"  # a box that contains all photos that have some
 
 
-@dataclass(frozen=True, slots=True)
-class LocateOptions:
-    """What is known beside the photos, and which proposals are accepted."""
-
-    accept: float
-    """probability from which a proposal is accepted"""
-    radius_m: float
-    """that the probability is for"""
-    motion: str
-    together: bool
-    gpx: Path | None
-    picture: bool
-    """whether the map is searched"""
-    server: str | None
-    map_name: str | None
-
-
-@dataclass(frozen=True, slots=True)
-class LocatedLibrary:
-    """The proposals for a library's photos, and what was written."""
-
-    photos: Sequence[LibraryPhoto]
-    located: Sequence[LocatedPhoto]
-    accepted: Sequence[LocatedPhoto]
-    written: WriteReport | None
-    """None if nothing was to be written"""
-    preview: Preview | None
-    """with the searches that were shown before, if they were used"""
-    keep_searches: Callable[[], None]
-    """Keeps the searches for the next write; last, so that nothing is lost if that fails"""
-
-    @property
-    def has_failures(self) -> bool:
-        """Whether a photo could not be searched or written."""
-        return any(each.error for each in self.located) or bool(
-            self.written and self.written.skipped
-        )
-
-
 def locate_library(
     library: PhotoLibrary,
     options: LocateOptions,
-    write: bool,
     open_client: Callable[[], AbstractContextManager[Client]],
-) -> LocatedLibrary:
-    """Propose positions for the photos without coordinates, and with `write`, write them.
+    **more_json: Json,
+) -> bool:
+    """Propose positions for the photos without coordinates, print, and with `write`, write them.
 
     With `write`, the searches are those that the last call without it has shown.
+
+    Returns:
+        Whether all photos could be searched and written.
 
     Raises:
         InvalidRequest: `unknown_time_zone`, `bad_gpx`, `bad_motion`.
@@ -98,7 +62,7 @@ def locate_library(
     path = preview_file(
         read_settings().placewise_home, library.identity, options.server, options.map_name
     )
-    preview = read_preview(path) if options.picture and write else None
+    preview = read_preview(path) if options.picture and options.write else None
     if options.together:
         check_time_zones(photos, "--together")
     unlocated = [photo for photo in photos if photo.is_unlocated]
@@ -122,22 +86,25 @@ def locate_library(
     accept_from = max(options.accept, 1e-9)
     accepted = [each for each in located if each.probability >= accept_from]
     written = None
-    if write:
+    if options.write:
         # A place is written only if it is accepted, too.
         located_surely = [
             each if (each.place_probability or 0.0) >= accept_from else replace(each, place=None)
             for each in accepted
         ]
         written = library.write(located_surely)
-
-    def keep_searches() -> None:
-        if new:
-            now = datetime.now(UTC) if preview is None else preview.searched_at
-            entries = {each.name: (each.state, searches[each.name]) for each in unlocated}
-            accepted_now = {each.photo.name: each.shown() for each in accepted}
-            write_preview(path, Preview(now, entries, accepted_now))
-
-    return LocatedLibrary(photos, located, accepted, written, preview, keep_searches)
+    if options.as_json:
+        print_json(to_json(photos, located, options.accept, written) | more_json)
+    else:
+        print_proposals(options, photos, located, accepted, written)
+    if preview is not None:
+        print_changes(preview, accepted)
+    if new:  # at the end, so that nothing is lost if it can't be written
+        now = datetime.now(UTC) if preview is None else preview.searched_at
+        entries = {each.name: (each.state, searches[each.name]) for each in unlocated}
+        accepted_now = {each.photo.name: each.shown() for each in accepted}
+        write_preview(path, Preview(now, entries, accepted_now))
+    return not (any(each.error for each in located) or (written is not None and written.skipped))
 
 
 def _search_photos(

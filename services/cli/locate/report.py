@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import typer
 from rich.markup import escape
 from rich.table import Column
 
-from services.cli.locate.library import LocatedPhoto, UndoReport
+from services.cli.locate.library import LibraryPhoto, LocatedPhoto, UndoReport, WriteReport
 from services.cli.locate.preview import Preview
-from services.cli.locate.proposals import LocatedLibrary
 from services.cli.output import (
     Json,
     Table,
@@ -25,7 +25,27 @@ from services.cli.output import (
 )
 
 
-def _print_changes(preview: Preview, accepted: Sequence[LocatedPhoto]) -> None:
+@dataclass(frozen=True, slots=True)
+class LocateOptions:
+    """The options that the commands share, and how they name what they write."""
+
+    accept: float
+    radius_m: float
+    motion: str
+    together: bool
+    gpx: Path | None
+    picture: bool
+    server: str | None
+    map_name: str | None
+    write: bool
+    as_json: bool
+    how_to_write: str
+    undo_command: str
+    written_are: str
+    """in the plural, such as files"""
+
+
+def print_changes(preview: Preview, accepted: Sequence[LocatedPhoto]) -> None:
     """Say of which preview the written proposals are, and which of them it did not show so."""
     shown = preview.accepted
     present = {each.photo.name: each.shown() for each in accepted}
@@ -43,30 +63,13 @@ def _print_changes(preview: Preview, accepted: Sequence[LocatedPhoto]) -> None:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class LibraryWords:
-    """How a command names what is written, and its own options and command lines."""
-
-    written: str
-    """in the plural, such as files"""
-    how_to_write: str
-    undo_command: str
-
-
-def report_located(
-    found: LocatedLibrary, accept: float, words: LibraryWords, as_json: bool, **more: Json | None
-) -> None:
-    """Print the proposals and what was written; as JSON with `more` members."""
-    if as_json:
-        print_json(_to_json(found, accept) | more)
-    else:
-        _print_proposals(found, accept, words)
-    if found.preview is not None:
-        _print_changes(found.preview, found.accepted)
-
-
-def _to_json(found: LocatedLibrary, accept: float) -> Json:
-    photos = found.photos
+def to_json(
+    photos: Sequence[LibraryPhoto],
+    located: Sequence[LocatedPhoto],
+    accept: float,
+    written: WriteReport | None,
+) -> Json:
+    """Return all that is known about a library's photos, with `accept` as the probability."""
     return {
         "photos": len(photos),
         "with_coordinates": sum(photo.latitude is not None for photo in photos),
@@ -88,19 +91,20 @@ def _to_json(found: LocatedLibrary, accept: float) -> Json:
                 "why_unknown": None if each.proposal else each.why_unknown,
                 "error": each.error,
             }
-            for each in found.located
+            for each in located
         ],
-        "written": asdict(found.written) if found.written else None,
+        "written": asdict(written) if written else None,
     }
 
 
-def _print_proposals(found: LocatedLibrary, accept: float, words: LibraryWords) -> None:
-    photos, located, accepted, written = (
-        found.photos,
-        found.located,
-        found.accepted,
-        found.written,
-    )
+def print_proposals(
+    options: LocateOptions,
+    photos: Sequence[LibraryPhoto],
+    located: Sequence[LocatedPhoto],
+    accepted: Sequence[LocatedPhoto],
+    written: WriteReport | None,
+) -> None:
+    """Print the proposals as a table, and what was written."""
     table = Table(
         "photo",
         Column("latitude", no_wrap=True),
@@ -137,7 +141,7 @@ def _print_proposals(found: LocatedLibrary, accept: float, words: LibraryWords) 
     print_message(
         f"{with_coordinates} of {len(photos)} photos have coordinates; "
         f"{len(accepted)} of the {len(located)} others have a proposal with at least "
-        f"{100 * accept:g} %."
+        f"{100 * options.accept:g} %."
     )
     without_zone = sum(p.time is not None and not p.time_zone_is_known for p in photos)
     if without_zone:
@@ -147,14 +151,14 @@ def _print_proposals(found: LocatedLibrary, accept: float, words: LibraryWords) 
         )
     if written is None:
         if accepted:
-            print_note(f"Nothing is written. {words.how_to_write} writes them.")
+            print_note(f"Nothing is written. {options.how_to_write} writes them.")
         return
     names = ", ".join(map(printable_text, written.written[:3])) + (
         " ..." if len(written.written) > 3 else ""
     )
     print_note(
-        f"{len(written.written)} {words.written} written{': ' if names else ''}{names}. "
-        f"Undo: {words.undo_command}"
+        f"{len(written.written)} {options.written_are} written{': ' if names else ''}{names}. "
+        f"Undo: {options.undo_command}"
     )
     for name, reason in written.skipped.items():
         line = f"[red]skipped[/red] {escape(printable_text(name))}: {escape(reason)}"

@@ -14,7 +14,7 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -39,8 +39,7 @@ class UndoJournal:
         for name in (BACKUPS, STAGED):
             (self._folder / name).mkdir(exist_ok=True)
         lines = _read_lines(self._journal)
-        # Without an incomplete last line, which a killed process has left.
-        _write_synced(self._journal, b"".join(_to_line(line) for line in lines))
+        repair_journal(self._journal, lines)
         self._read: dict[Path, str | None] = {}  # staged file -> SHA-256 of the file it is made of
         self._known: dict[str, set[str | None]] = {}  # path -> SHA-256 of what undo may discard
         for line in lines:
@@ -209,6 +208,11 @@ def read_journal(journal: Path, check: Callable[[Json], object]) -> list[Json]:
             ) from error
         lines.append(line)
     return lines
+
+
+def repair_journal(journal: Path, lines: Sequence[Json]) -> None:
+    """Take away an incomplete last line, which a killed process has left."""
+    _write_synced(journal, b"".join(_to_line(line) for line in lines))
 
 
 def append_to_journal(journal: Path, line: Json) -> None:

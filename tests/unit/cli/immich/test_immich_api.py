@@ -106,12 +106,12 @@ def test_an_edited_picture_has_another_state_and_coordinates_of_zero_are_none(
 @pytest.mark.parametrize(
     ("answer", "kind", "code", "words"),
     [
-        (refused(401, "Invalid API key"), Unauthorized, "immich_key_refused", "IMMICH_API_KEY"),
+        (refused(401, "Invalid API key"), Unauthorized, "immich_refused", "IMMICH_API_KEY"),
         (
             refused(403, "Missing required permission: asset.read"),
-            Forbidden, "immich_permission_missing", "asset.read. Add it to the API key",
+            Forbidden, "immich_refused", "asset.read. Add it to the API key",
         ),
-        (refused(404, "Asset media not found"), NotFound, "immich_not_found", "Asset media"),
+        (refused(404, "Asset media not found"), NotFound, "immich_refused", "Asset media"),
         (refused(400, ["a", "b"]), Unprocessable, "immich_refused", "a; b"),
         ((500, b"<html>", {}), Unprocessable, "immich_refused", "500"),
         ((200, b"<html>", {}), Unprocessable, "immich_refused", "Is it the address of Immich?"),
@@ -157,7 +157,7 @@ def test_a_server_that_stays_away_is_given_up(
     immich.shutdown()
     immich.server_close()
     with pytest.raises(Unavailable, match="does not answer"):
-        ImmichApi(immich.url, KEY)._attempt("GET", "/server/version", {})
+        client.version()
     assert waits == []
 
 
