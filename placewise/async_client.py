@@ -104,6 +104,15 @@ class AsyncClient(AsyncTransport):
         headers = {"Content-Type": "application/x-ndjson"}
         return await self._start_batch(content=body, headers=headers)
 
+    async def sync_library(self, *, every_hours: int | None = None) -> answers.Started:
+        """Bring the map up to date with the photo library of the server's settings.
+
+        Args:
+            every_hours: Hours between the end of a run and the next; None: once.
+        """
+        body = {"every_hours": every_hours}
+        return answers.Started(**await self._call("POST", "/library-syncs", json=body))
+
     async def import_prefix(self, prefix: str) -> answers.BatchStarted:
         """Start a batch import of all photos in the server's store below a key prefix."""
         return await self._start_batch(files={"prefix": (None, prefix)})
