@@ -22,8 +22,7 @@ from services.cli.locate.command import (
     RadiusOption,
     TogetherOption,
 )
-from services.cli.locate.proposals import locate_library
-from services.cli.locate.report import LocateOptions, report_undo
+from services.cli.locate.proposals import LocateOptions, locate_library, report_undo
 from services.cli.output import (
     Json,
     JsonOption,

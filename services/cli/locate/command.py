@@ -9,8 +9,7 @@ from typing import Annotated
 import typer
 
 from services.cli.client import connect
-from services.cli.locate.proposals import locate_library
-from services.cli.locate.report import LocateOptions, report_undo
+from services.cli.locate.proposals import LocateOptions, locate_library, report_undo
 from services.cli.locate.writers import FolderLibrary, Target
 from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption, TimeZoneOption
 from shared.config.command_line import command_line
