@@ -9,6 +9,7 @@ import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,14 @@ from rich.progress import Progress
 from rich.table import Column
 
 from lab.cli.evaluation.describers import checkpoint_describer, extractor_describer
+from lab.cli.evaluation.results import check_output_folders
 from lab.datasets.dataset import EvaluationSet
 from lab.datasets.open_dataset import open_evaluation_set
 from lab.evaluation.exact_knn import exact_knn
 from lab.evaluation.paired_runs import PairedDifference, paired_differences
 from lab.evaluation.query_clusters import cluster_queries
 from lab.evaluation.ranking import DEFAULT_KS, Rows, describe_evaluation_set
-from lab.evaluation.report.comparison import ComparedExtractor, pareto_front, render_comparison
+from lab.evaluation.report.comparison import ComparedExtractor, pareto_front, write_comparison
 from lab.evaluation.results import package_versions
 from lab.evaluation.retrieval_metrics import RetrievalMetrics, compute_metrics
 from services.cli.environment import read_settings
@@ -155,7 +157,8 @@ def compare_extractors(
     """
     entries = parse_entries(extractors)
     settings = read_settings()
-    _validate_entries(entries, settings, out)
+    _validate_entries(entries, settings)
+    check_output_folders(out)
     evaluation_set = open_evaluation_set(data, set_name, protocol=protocol, rule=rule)
     clusters = cluster_queries(evaluation_set.queries)
     compared: list[ComparedExtractor] = []
@@ -176,8 +179,7 @@ def compare_extractors(
         text = json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
         with refuse_unwritable(out):
             (out / "comparison.json").write_text(text, encoding="utf-8")
-            page = render_comparison(evaluation_set, compared)
-            (out / "report.html").write_text(page, encoding="utf-8")
+            write_comparison(out, evaluation_set, compared)
     if as_json:
         print_json(report)
         return
@@ -186,9 +188,7 @@ def compare_extractors(
         print_message(printable_path(out / "report.html"))
 
 
-def _validate_entries(
-    entries: Sequence[ComparisonEntry], settings: Settings, out: Path | None
-) -> None:
+def _validate_entries(entries: Sequence[ComparisonEntry], settings: Settings) -> None:
     """Check all entries before the first evaluation, which may take hours."""
     for entry in entries:
         if entry.name.endswith(CHECKPOINT_SUFFIXES):
@@ -206,9 +206,6 @@ def _validate_entries(
             raise InvalidRequest(
                 "bad_extractors", f"{entry.spec_text}: {config.name} uses no vocabulary."
             )
-    if out is not None:
-        with refuse_unwritable(out):
-            out.mkdir(parents=True, exist_ok=True)
 
 
 def _evaluate_entry(
@@ -226,13 +223,9 @@ def _evaluate_entry(
         )
     )
     on_progress = stage_bars(progress, f"{entry.spec_text}: ")
-    describer.describe.on_lookup = lambda done, total: on_progress(
-        "cached descriptors", done, total
-    )
-    with describe_evaluation_set(describer.describe, evaluation_set, on_progress=on_progress) as (
-        database,
-        queries,
-    ):
+    describer.describe.on_lookup = partial(on_progress, "cached descriptors")
+    with describe_evaluation_set(describer.describe, evaluation_set, on_progress) as rows:
+        database, queries = rows
         milliseconds = describer.describe.milliseconds_a_photo()
         if entry.pca is not None:
             database, queries, projection_ms = whiten_set(
@@ -240,13 +233,9 @@ def _evaluate_entry(
             )
             if milliseconds is not None:
                 milliseconds += projection_ms
-        ranked = exact_knn(
-            queries,
-            database,
-            max(DEFAULT_KS),
-            faiss_gpu=faiss_gpu,
-            on_progress=lambda done, total: on_progress("search", done, total),
-        )
+        search = partial(on_progress, "search")
+        depth = max(DEFAULT_KS)
+        ranked = exact_knn(queries, database, depth, faiss_gpu=faiss_gpu, on_progress=search)
         dimension = database.shape[1]
     measured = compute_metrics(
         ranked.indices,

@@ -28,6 +28,13 @@ if TYPE_CHECKING:
 BLUE, RED, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#c4c4c4"
 
 
+class Chart(Markup):
+    """An `<img>` element, and the figure that it shows."""
+
+    figure: Figure
+    caption: str
+
+
 def percent_chart(
     x_label: str, y_label: str, *, x_ticks: Sequence[float] | None = None, log: bool = False
 ) -> tuple[Figure, Axes]:
@@ -54,7 +61,7 @@ def percent_chart(
     return figure, axes
 
 
-def render_chart(figure: Figure, title: str) -> Markup:
+def render_chart(figure: Figure, title: str) -> Chart:
     """Render a chart as an `<img>` element; the title is its alternative text."""
     from matplotlib import rc_context
 
@@ -62,10 +69,13 @@ def render_chart(figure: Figure, title: str) -> Markup:
     with rc_context({"svg.hashsalt": title, "svg.fonttype": "none"}):
         figure.savefig(svg, format="svg", metadata={"Creator": None, "Date": None})
     encoded = base64.b64encode(svg.getvalue().encode()).decode()
-    return Markup('<img src="data:image/svg+xml;base64,{}" alt="{}">').format(encoded, title)
+    image = Markup('<img src="data:image/svg+xml;base64,{}" alt="{}">').format(encoded, title)
+    chart = Chart(image)
+    chart.figure, chart.caption = figure, title
+    return chart
 
 
-def recall_chart(result: EvaluationResult) -> Markup:
+def recall_chart(result: EvaluationResult) -> Chart:
     """Render recall@k over k."""
     curve = np.asarray(result.measured.recall_curve)
     ks = np.arange(1, len(curve) + 1)
@@ -83,7 +93,7 @@ def recall_chart(result: EvaluationResult) -> Markup:
     return render_chart(figure, "Recall@k")
 
 
-def precision_chart(result: EvaluationResult) -> Markup | None:
+def precision_chart(result: EvaluationResult) -> Chart | None:
     """Render the precision-recall curve; None without scores."""
     curve = result.measured.curve
     if curve is None:
@@ -94,7 +104,7 @@ def precision_chart(result: EvaluationResult) -> Markup | None:
     return render_chart(figure, "Precision and recall of the first match")
 
 
-def reliability_chart(levels: Sequence[dict[str, Any]]) -> Markup:
+def reliability_chart(levels: Sequence[dict[str, Any]]) -> Chart:
     """Render the observed share of right answers over the stated probability, a line a level.
 
     `levels` are the figures of each level (`reliability_figures`), finest first.
@@ -113,7 +123,7 @@ def reliability_chart(levels: Sequence[dict[str, Any]]) -> Markup:
     return render_chart(figure, "Reliability of the probabilities of levels")
 
 
-def distance_chart(result: EvaluationResult) -> Markup | None:
+def distance_chart(result: EvaluationResult) -> Chart | None:
     """Render the cumulative distance error of first matches; None without positions."""
     metres = result.measured.metres
     error = None if metres is None else distance_error(metres[:, 0])
@@ -137,7 +147,7 @@ MAX_DATABASE_POINTS = 4000
 MAX_QUERY_POINTS = 2000
 
 
-def positions_chart(result: EvaluationResult) -> tuple[Markup, str] | None:
+def positions_chart(result: EvaluationResult) -> tuple[Chart, str] | None:
     """Render a map of queries and first matches, and its caption; None without positions."""
     zone = _most_common_zone(result.evaluation_set.queries)
     database = _utm_positions(result.evaluation_set.database, zone)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
-
-from markupsafe import Markup
 
 from lab.datasets.dataset import EvaluationSet
 from lab.evaluation.paired_runs import PairedDifference
-from lab.evaluation.report.charts import GREY, percent_chart, render_chart
+from lab.evaluation.report.charts import GREY, Chart, percent_chart, render_chart
 from lab.evaluation.report.page import render_page
+from lab.evaluation.report.tables import write_figures, write_tables
 from lab.evaluation.retrieval_metrics import RetrievalMetrics
 
 
@@ -93,28 +93,32 @@ class ComparedExtractor:
         }
 
 
-def render_comparison(evaluation_set: EvaluationSet, compared: Sequence[ComparedExtractor]) -> str:
-    """Render the HTML page that compares extractors on one evaluation set."""
-    sizes, times = (
-        [each.bytes_a_photo for each in compared],
-        [each.milliseconds for each in compared],
+def write_comparison(
+    out: Path, evaluation_set: EvaluationSet, compared: Sequence[ComparedExtractor]
+) -> None:
+    """Write the HTML page that compares extractors on one evaluation set, tables and figures."""
+    sizes = [each.bytes_a_photo for each in compared]
+    times = [each.milliseconds for each in compared]
+    charts = (
+        _cost_chart("Recall and size", "bytes per photo", compared, sizes),
+        _cost_chart("Recall and time", "CPU ms per photo", compared, times),
     )
-    return render_page(
+    write_tables(out, [(each.name, each.measured) for each in compared])
+    write_figures(out, evaluation_set.name, charts)
+    page = render_page(
         "comparison.html",
         title=f"Descriptors on {evaluation_set.name}",
         data_set=evaluation_set,
         compared=compared,
         clusters=compared[0].measured.clusters,
-        charts=(
-            _cost_chart("Recall and size", "bytes per photo", compared, sizes),
-            _cost_chart("Recall and time", "CPU ms per photo", compared, times),
-        ),
+        charts=charts,
     )
+    (out / "report.html").write_text(page, encoding="utf-8")
 
 
 def _cost_chart(
     title: str, label: str, compared: Sequence[ComparedExtractor], costs: Sequence[float]
-) -> Markup | None:
+) -> Chart | None:
     """Render R@1 over a cost, with the Pareto front as a line; None if no cost is known."""
     recalls = [each.recall_at_1 for each in compared]
     known = [cost for cost in costs if cost > 0]  # excludes NaN
