@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from placewise.client import Client
-from tests.support.immich_server import KEY, ImmichServer, running_immich
+from tests.support.immich_server import KEY, NOON, ImmichServer, running_immich, time_text
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.processes import PLACEWISE, Process, start
 from tests.support.server import ServerProcess, environment, run_command
@@ -126,7 +127,9 @@ def test_the_map_follows_what_was_changed_moved_or_deleted(walk: Walk) -> None:
     assert (photos["Trip/IMG_2.jpg"].latitude, photos["Trip/IMG_2.jpg"].longitude) == (1.5, 8.0)
     assert walk.client.image(photos["Trip/IMG_4.jpg"].image_id) == photo_bytes(77)
     walk.immich.assets[moved]["originalFileName"] = "renamed.jpg"
-    assert walk.indexed()["changed"] == 1
+    walk.immich.assets[replaced]["fileModifiedAt"] = time_text(NOON + timedelta(days=1))
+    counts = walk.indexed()
+    assert (counts["changed"], counts["indexed"], counts["searchable"]) == (1, 1, 19)
     assert "Trip/renamed.jpg" in {photo.relative_path for photo in walk.client.photos()}
 
 

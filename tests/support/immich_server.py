@@ -66,7 +66,8 @@ class ImmichServer(ThreadingHTTPServer):
             "id": asset_id, "ownerId": USER, "type": "IMAGE", "originalFileName": name,
             "checksum": sha1(picture, usedforsecurity=False).hexdigest(), "thumbhash": "1",
             "isTrashed": False, "isEdited": False, "visibility": "timeline",
-            "fileCreatedAt": time_text(taken), "updatedAt": time_text(datetime.now(UTC)),
+            "fileCreatedAt": time_text(taken), "fileModifiedAt": time_text(taken),
+            "updatedAt": time_text(datetime.now(UTC)),
             "localDateTime": time_text(taken + timedelta(hours=2)),
             "exifInfo": {
                 "latitude": latitude, "longitude": longitude, "make": "Maker", "model": "X100",

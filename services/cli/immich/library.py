@@ -156,7 +156,9 @@ def _library_photo(image: Json, album: str) -> LibraryPhoto:
     if taken and exif.get("timeZone"):
         taken = _time(exif["dateTimeOriginal"])
         offset = clock - taken
-    picture = [image["checksum"], *([image["thumbhash"]] if image.get("isEdited") else [])]
+    # The checksum of a file in an external library is that of its path.
+    picture = [image["checksum"], image["fileModifiedAt"]]
+    picture += [image["thumbhash"]] if image.get("isEdited") else []
     latitude, longitude = _place(_coordinates(image)) or (None, None)
     return LibraryPhoto(
         f"{album}/{image['originalFileName']}" if album else image["originalFileName"],

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -21,7 +21,7 @@ from placewise.client import Client
 from services.cli.ingest.geotags import LocalPhoto
 from services.cli.ingest.upload import upload_photos
 from services.cli.locate.library import LibraryPhoto, PhotoLibrary
-from services.cli.output import Json, utf8_path
+from services.cli.output import Json
 from shared.errors import NotFound
 from shared.ingest.photo_metadata import parse_relative_path
 
@@ -52,33 +52,30 @@ def sync_map(
         `searchable`, and the photos that `failed`, with reasons.
     """
     located = {photo.id: photo for photo in photos if photo.latitude is not None}
-    stored: dict[str, Photo] = {
-        each.metadata["library_id"]: each
-        for each in client.photos(tags=library.identity)
-        if "library_id" in each.metadata
-    }
-    gone = stored.keys() - located.keys()
-    if gone - {photo.id for photo in photos}:  # a listing may miss what others move meanwhile
-        gone -= {photo.id for photo in library.list_photos() if photo.latitude is not None}
+    stored = _stored_photos(client, library)
+    current = {_id(each): each for each in stored if _is_current(each, located)}
     changed = 0
-    uploads: dict[str, LocalPhoto] = {}
-    for photo_id, photo in located.items():
-        there, fields = stored.get(photo_id), _fields(photo)
-        if there is None or there.metadata["library_state"] != photo.state:
-            uploads[photo_id] = _upload(library, photo, fields)
-        elif fields != {name: _as_json(getattr(there, name)) for name in fields}:
+    for photo_id, there in current.items():
+        fields = _fields(located[photo_id])
+        if fields != {name: _as_json(getattr(there, name)) for name in fields}:
             client.patch_photo(there.image_id, **fields)
             changed += 1
-    report = upload_photos(client, list(uploads.values()), progress)
+    uploads = [_upload(library, each) for each in located.values() if each.id not in current]
+    report = upload_photos(client, uploads, progress, update=True)
     failed = report["refused"] + report["failed"]
     kept = {each["path"] for each in failed}
-    replaced = {key for key, each in uploads.items() if utf8_path(each.path) not in kept}
-    for photo_id in gone | (replaced & stored.keys()):
-        with contextlib.suppress(NotFound):  # somebody else was faster
-            client.delete_photo(stored[photo_id].image_id)
+    gone = {_id(each) for each in stored} - located.keys()
+    if gone - {photo.id for photo in photos}:  # a listing may miss what others move meanwhile
+        gone -= {photo.id for photo in library.list_photos() if photo.latitude is not None}
+    for each in _stored_photos(client, library):
+        photo = located.get(_id(each))
+        is_replaced = photo is not None and str(Path(photo.name)) not in kept
+        if _id(each) in gone or (is_replaced and not _is_current(each, located)):
+            with contextlib.suppress(NotFound):  # somebody else was faster
+                client.delete_photo(each.image_id)
     return {
         "with_coordinates": len(located),
-        "indexed": len(replaced),
+        "indexed": len(uploads) - len(failed),
         "changed": changed,
         "removed": len(gone),
         "searchable": client.stats().searchable_images,
@@ -86,9 +83,24 @@ def sync_map(
     }
 
 
-def _upload(library: PhotoLibrary, photo: LibraryPhoto, fields: Json) -> LocalPhoto:
+def _stored_photos(client: Client, library: PhotoLibrary) -> list[Photo]:
+    photos = client.photos(tags=library.identity)
+    return [each for each in photos if "library_id" in each.metadata]
+
+
+def _id(photo: Photo) -> str:
+    return str(photo.metadata["library_id"])
+
+
+def _is_current(photo: Photo, located: Mapping[str, LibraryPhoto]) -> bool:
+    """Return whether the photo has the picture that the library has now."""
+    there = located.get(_id(photo))
+    return there is not None and photo.metadata["library_state"] == there.state
+
+
+def _upload(library: PhotoLibrary, photo: LibraryPhoto) -> LocalPhoto:
     metadata = json.dumps({"library_id": photo.id, "library_state": photo.state})
-    form = {name: str(value) for name, value in fields.items() if value is not None}
+    form = {name: str(value) for name, value in _fields(photo).items() if value is not None}
     form |= {"tags": library.identity, "metadata": metadata}
     return _LibraryUpload(Path(photo.name), form, library=library, photo=photo)
 
