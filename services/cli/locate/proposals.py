@@ -14,7 +14,6 @@ import typer
 from rich.markup import escape
 from rich.table import Column
 
-from placewise.answers import CameraPose, Similar
 from placewise.client import Client
 from services.cli.environment import read_settings
 from services.cli.locate.folder import check_time_zones, read_gpx
@@ -45,19 +44,15 @@ from services.cli.output import (
     progress_bar,
 )
 from shared.errors import PlacewiseError
-from shared.geotagging.evidence import (
-    KnownPosition,
-    PictureEvidence,
-    PosePosition,
-    ProbableCircle,
-    SimilarPosition,
-    TimeNeighbours,
-    interpolate_position,
+from shared.geotagging.evidence import KnownPosition, TimeNeighbours
+from shared.geotagging.locate import (
+    SIMILAR_PHOTOS,
+    PositionFinder,
+    picture_evidence,
+    probable_label,
 )
-from shared.geotagging.fusion import propose_position
-from shared.tracks.motion import MotionModel, parse_motion
+from shared.tracks.motion import parse_motion
 
-SIMILAR_PHOTOS = 50
 SEARCHES_AT_ONCE = 4
 WITH_COORDINATES = "-90,-180,90,180"  # a box that contains all photos that have some
 
@@ -120,10 +115,8 @@ def locate_library(
         with open_client() as client:
             searches |= _search_photos(client, library, new)
     neighbours = TimeNeighbours(photos, options.together)
-    located = [
-        _locate_photo(photo, searches.get(photo.name), neighbours, track, moves, options.radius_m)
-        for photo in unlocated
-    ]
+    finder = PositionFinder(neighbours, track, moves, options.radius_m)
+    located = [_locate_photo(photo, searches.get(photo.name), finder) for photo in unlocated]
     accept_from = max(options.accept, 1e-9)
     accepted = [each for each in located if each.probability >= accept_from]
     written = None
@@ -177,79 +170,17 @@ def _search_photo(
         if error.status not in (400, 413, 415, 422):  # 400: an empty file
             raise
         return SearchedPhoto(error=error.detail)
-    estimate = answer.estimate
-    named = () if estimate.in_map is False else estimate.levels
-    label = next((each for each in named if each.place), None)
-    return SearchedPhoto(
-        picture_evidence(answer, photo_count),
-        label.place if label else None,
-        label.probability if label else None,
-    )
+    return SearchedPhoto(picture_evidence(answer, photo_count), *probable_label(answer.estimate))
 
 
 def _locate_photo(
-    photo: LibraryPhoto,
-    searched: SearchedPhoto | None,
-    neighbours: TimeNeighbours,
-    track: Sequence[KnownPosition],
-    moves: MotionModel,
-    radius_m: float,
+    photo: LibraryPhoto, searched: SearchedPhoto | None, finder: PositionFinder
 ) -> LocatedPhoto:
-    speed = moves.max_speed_mps
-    on_track = None if photo.time is None else interpolate_position(track, photo.time, speed)
     searched = searched or SearchedPhoto()
-    by_time = neighbours.position_of(photo, speed)
+    proposal, reason = finder.propose(photo, searched.evidence)
     return LocatedPhoto(
-        photo,
-        propose_position(searched.evidence, by_time, on_track, radius_m),
-        searched.place,
-        searched.place_probability,
-        searched.error,
-        neighbours.why_unknown(photo, searched.evidence),
+        photo, proposal, searched.place, searched.place_probability, searched.error, reason
     )
-
-
-def picture_evidence(answer: Similar, photo_count: int) -> PictureEvidence:
-    """Return what a search says about the position.
-
-    Args:
-        photo_count: Number of photos of the map.
-    """
-    estimate = answer.estimate
-    is_unlocated = not (estimate.has_place or estimate.levels)
-    stated = (estimate.not_in_map_probability, estimate.elsewhere)
-    return PictureEvidence(
-        [
-            SimilarPosition(
-                photo.latitude,
-                photo.longitude,
-                photo.similarity_score,
-                photo.relative_path or photo.original_filename,
-            )
-            for photo in answer.similar_images
-            if photo.latitude is not None and photo.longitude is not None and not is_unlocated
-        ],
-        [
-            ProbableCircle(level.latitude, level.longitude, level.radius_m, level.probability)
-            for level in estimate.levels
-            if level.latitude is not None
-            and level.longitude is not None
-            and level.radius_m is not None
-        ],
-        next((share for share in stated if share is not None), 1.0),
-        photo_count,
-        _pose_position(answer.pose),
-        estimate.headline,
-    )
-
-
-def _pose_position(pose: CameraPose | None) -> PosePosition | None:
-    """Return the pose, if it has coordinates."""
-    if pose is None or pose.latitude is None or pose.longitude is None:
-        return None
-    if pose.radius_68_m is None or pose.heading is None:
-        return None
-    return PosePosition(pose.latitude, pose.longitude, pose.radius_68_m, pose.heading)
 
 
 def _print_changes(preview: Preview, accepted: Sequence[LocatedPhoto]) -> None:
