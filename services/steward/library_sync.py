@@ -53,6 +53,7 @@ class LibrarySyncWorker:
         with self._catalog.read() as session:
             map_name = session.get_one(Map, job.map_id).name
         result = self._sync(map_name, JobProgress(self._catalog, job, stop))
+        result["every_hours"] = job.params["every_hours"]
         with self._catalog.write() as session:
             leased = lock_leased_job(session, job)
             if leased is not None:

@@ -203,6 +203,7 @@ def test_the_job_of_a_server_follows_immich_and_names_its_error(tmp_path: Path) 
                 assert job.result == {
                     "with_coordinates": 20, "indexed": 20, "changed": 0, "removed": 0,
                     "searchable": 20, "failed": [], "without_coordinates": 3, "located": 3,
+                    "every_hours": 24,
                 }  # fmt: skip
                 assert immich.updates == []
                 immich.permissions.remove("asset.read")

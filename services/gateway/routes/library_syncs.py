@@ -42,7 +42,8 @@ def sync_library(
 
     Nothing is written into the library. A map has one such job, which is queued again each time.
     Its `result` has the counts `with_coordinates`, `indexed`, `changed`, `removed`, `searchable`,
-    `without_coordinates` and `located` (those with an accepted proposal), and `failed` photos.
+    `without_coordinates` and `located` (those with an accepted proposal), `failed` photos, and
+    `every_hours`.
     """
     params = options.model_dump()
     with gateway.catalog.write() as session:
