@@ -114,7 +114,6 @@ def _kinds(condition: Callable[[JobType], bool]) -> tuple[JobKind, ...]:
 DRAINED_JOBS = _kinds(lambda kind: kind.run_by == RunBy.EXTRACTOR)
 FIT_WORKER_JOBS = _kinds(lambda kind: kind.run_by == RunBy.FIT_WORKER)
 EXTRACTOR_JOBS = DRAINED_JOBS + FIT_WORKER_JOBS
-STEWARD_JOBS = _kinds(lambda kind: kind.run_by == RunBy.STEWARD)
 SINGLE_CLAIM_JOBS = _kinds(lambda kind: kind.run_by != RunBy.STEWARD and not kind.in_batches)
 MODEL_CHANGE_JOBS = _kinds(lambda kind: kind.changes_model)
 CHECKPOINTED_JOBS = _kinds(lambda kind: kind.changes_model or kind.in_slices)

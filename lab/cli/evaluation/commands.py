@@ -334,7 +334,7 @@ def compare(
     rule: RuleOption = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Output folder: comparison.json, report.html, tables, figures."),
+        typer.Option(help="Output folder for table.csv, table.tex and a figure of recall@k."),
     ] = None,
     faiss_gpu: FaissGpuOption = False,
     extractor: Annotated[

@@ -41,7 +41,6 @@ from shared.tracks.motion import MotionModel
 METHODS = {
     "single": "single frames",
     "seqslam": "SeqSLAM, constant velocity",
-    "hmm": "hidden Markov model",
     "filter": "filter",
     "smoothed": "filter, forward and backward",
 }

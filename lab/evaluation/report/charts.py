@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lab.datasets.dataset import DatasetPhoto
 from lab.evaluation.results import EvaluationResult
-from lab.evaluation.retrieval_metrics import distance_error
+from lab.evaluation.retrieval_metrics import RetrievalMetrics, distance_error
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -90,6 +90,17 @@ def recall_chart(result: EvaluationResult) -> Chart:
     if 0 < findable < total:
         axes.plot(ks, curve * total / findable, ".-", color=RED, label="queries with a positive")
     axes.legend()
+    return render_chart(figure, "Recall@k")
+
+
+def recall_comparison(measured: Sequence[tuple[str, RetrievalMetrics]]) -> Chart:
+    """Render recall@k over k, a line for each name."""
+    depth = len(measured[0][1].recall_curve)
+    ticks = [k for k in (1, 5, 10, 20) if k <= depth]
+    figure, axes = percent_chart("k: number of retrieved photos", "recall@k", x_ticks=ticks)
+    for name, each in measured:
+        axes.plot(range(1, depth + 1), each.recall_curve, ".-", label=name)
+    axes.legend(fontsize="small")
     return render_chart(figure, "Recall@k")
 
 

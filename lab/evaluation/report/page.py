@@ -1,4 +1,4 @@
-"""Renders the HTML reports of evaluations and comparisons from the folder `templates`.
+"""Renders the HTML reports of evaluations from the folder `templates`.
 
 A report is one file: its charts and photos are inside, and it fetches nothing.
 """
@@ -51,19 +51,13 @@ def write_report(
         drawn = (*charts, levels or None, positions and positions[0])
         write_figures(out, result.evaluation_set.name, drawn)
     write_tables(out, [(each.evaluation_set.name, each.measured) for each in results])
-    page = render_page(
-        "evaluation.html",
+    page = _templates.get_template("evaluation.html").render(
         title=f"Evaluation of {run.name}",
         about={"model": run.name, "fingerprint": run.fingerprint or "unknown", **run.about},
         versions=", ".join(f"{name} {number}" for name, number in package_versions().items()),
         sections=sections,
     )
     (out / "report.html").write_text(page, encoding="utf-8")
-
-
-def render_page(template: str, **values: Any) -> str:
-    """Render a page of the folder `templates`."""
-    return _templates.get_template(template).render(**values)
 
 
 def _format_share(

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import httpx2
-import pytest
 
 from services.steward.tasks.model_changes import advance_model_changes
 from shared.jobs import InProcessWakeups
@@ -16,8 +15,6 @@ from tests.integration.in_process_api import API, Service
 from tests.support.photos import encoded, photo_bytes, photo_image
 
 # No URL depends on the database.
-pytestmark = pytest.mark.databases("sqlite")
-
 MAP = "words"
 URLS = re.compile(r".+_url|image_path")
 # With a bucket alone: tests/integration/gateway/test_presigned_uploads.py.

@@ -50,6 +50,8 @@ from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import add_job, add_reconstruction, stored_rows
 from tests.support.photos import photo_bytes
 
+pytestmark = pytest.mark.databases("postgresql")
+
 SAID: dict[str, Any] = {
     "latitude": 45.5,
     "longitude": 7.25,

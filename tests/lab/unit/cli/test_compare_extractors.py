@@ -1,10 +1,9 @@
-"""What `placewise compare --extractors` means, and which descriptors are worth their price."""
+"""What `placewise compare --extractors` means, and charts of reports."""
 
 from __future__ import annotations
 
 import base64
 import csv
-import math
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ import pytest
 from lab.cli.evaluation.compare_extractors import ComparisonEntry, parse_entries
 from lab.evaluation.query_clusters import singleton_clusters
 from lab.evaluation.report.charts import percent_chart, render_chart
-from lab.evaluation.report.comparison import pareto_front
 from lab.evaluation.report.tables import write_tables
 from lab.evaluation.retrieval_metrics import compute_metrics
 from shared.errors import InvalidRequest
@@ -34,14 +32,6 @@ def test_invalid_lists_of_extractors_are_refused(text: str) -> None:
     with pytest.raises(InvalidRequest) as refused:
         parse_entries(text)
     assert refused.value.code == "bad_extractors"
-
-
-def test_the_pareto_front_holds_extractors_that_none_dominates() -> None:
-    prices = [1.0, 2.0, 2.0, 3.0, 4.0, math.nan]
-    worths = [0.5, 0.7, 0.6, 0.7, 0.9, 1.0]
-    # dearer and worse than the second; as good and dearer; not measured
-    assert pareto_front(prices, worths) == [True, True, False, False, True, False]
-    assert pareto_front([1.0, 1.0], [0.5, 0.5]) == [True, True], "neither beats the other"
 
 
 def test_equal_charts_have_equal_bytes_and_their_labels_are_text() -> None:
