@@ -64,7 +64,7 @@ class ImmichLibrary:
             image["id"]: image
             for image in self._api.images()
             if image["ownerId"] == self._user_id
-            and not (image["isTrashed"] or image["visibility"] == "locked")
+            and not (image["isTrashed"] or image.get("visibility") == "locked")
         }
         photos: dict[str, LibraryPhoto] = {}
         for image in own.values():
