@@ -179,6 +179,13 @@ def test_a_command_that_is_killed_in_the_middle_is_continued_and_undone(walk: Wa
     assert walk.positions() == [(45.0, 8.0), (0.0, 0.0), (0.0, 0.0)]
 
 
+def test_a_photo_without_a_preview_is_named_and_the_others_are_located(walk: Walk) -> None:
+    walk.immich.pictures[walk.unlocated[9]] = b""
+    shown = walk.run(code=1)
+    assert "Immich answers 404 to GET" in shown
+    assert shown.count("looks like") == 2
+
+
 def test_a_missing_key_or_permission_is_named_and_nothing_is_changed(walk: Walk) -> None:
     env = {**walk.environment(), "IMMICH_API_KEY": ""}
     run = run_command(*walk.arguments(), env=env, cwd=walk.folder)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
@@ -18,6 +17,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import urlsplit
 from uuid import UUID, uuid4
+
+from tests.support.fake_server import serving
 
 KEY = "immich-key"
 USER, PARTNER = str(uuid4()), str(uuid4())
@@ -199,11 +200,5 @@ def refused(status: int, message: Any, **headers: str) -> Answer:
 
 @contextlib.contextmanager
 def running_immich() -> Iterator[ImmichServer]:
-    with ImmichServer() as made:
-        thread = threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        try:
-            yield made
-        finally:
-            made.shutdown()
-            thread.join()
+    with ImmichServer() as made, serving(made):
+        yield made

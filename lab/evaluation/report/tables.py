@@ -5,11 +5,11 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Sequence
+from itertools import repeat
 from pathlib import Path
 
 from lab.evaluation.report.charts import Chart
 from lab.evaluation.retrieval_metrics import RetrievalMetrics
-from shared.evaluation.bootstrap import ConfidenceInterval
 
 LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 LATEX |= {character: f"\\{character}" for character in "&%$#_{}"}
@@ -27,8 +27,8 @@ def write_tables(folder: Path, rows: Sequence[tuple[str, RetrievalMetrics]]) -> 
     latex = [f"% name & {' & '.join(names)}: per cent (95 % interval)"]
     for name, measured in rows:
         shares = [*measured.recalls.recall_all.values(), measured.mean_average_precision]
-        intervals: list[ConfidenceInterval | None] = [measured.map_interval]
-        intervals[:0] = measured.recall_intervals or [None] * len(measured.recalls.recall_all)
+        recalls = measured.recall_intervals or repeat(None, len(shares) - 1)
+        intervals = [*recalls, measured.map_interval]
         values: list[object] = []
         cells = ["".join(LATEX.get(character, character) for character in name)]
         for share, interval in zip(shares, intervals, strict=True):

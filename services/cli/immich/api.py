@@ -15,33 +15,21 @@ from typing import Any
 import httpx2
 
 from placewise.protocol import Json, RetryPolicy, response_error, validate_url
-from shared.errors import (
-    Forbidden,
-    NotFound,
-    PlacewiseError,
-    TooManyRequests,
-    Unauthorized,
-    Unavailable,
-    Unprocessable,
-)
+from shared.errors import NotFound, PlacewiseError, TooManyRequests, Unavailable, Unprocessable
 
 TIMEOUT_SECONDS = 60.0
 RETRY_PERIOD_SECONDS = 60.0
 PAGE_SIZE = 1000  # the most that Immich returns
 WRITE_INTERVAL_SECONDS = 0.1
 """Between two writes: each makes Immich write a sidecar and look up the name of the place"""
-HINTS: dict[int, tuple[type[PlacewiseError], str]] = {
-    401: (Unauthorized, "Check IMMICH_API_KEY."),
-    403: (Forbidden, "Add it to the API key."),
-}
+HINTS = {401: " Check IMMICH_API_KEY.", 403: " Add it to the API key."}
 Coordinates = tuple[float, float]
 
 
 class ImmichApi:
     """Calls one Immich server as one user; busy or unavailable, it is called again for a minute.
 
-    Every call raises Unauthorized, Forbidden, NotFound, TooManyRequests or Unavailable as Immich
-    answers, and Unprocessable for every other error; the code is `immich_refused`.
+    Every call raises the PlacewiseError of the status that Immich answers: `immich_refused`.
     """
 
     def __init__(self, url: str, key: str) -> None:
@@ -141,11 +129,9 @@ def _error_of(response: httpx2.Response) -> PlacewiseError:
         message = json.loads(response.text)["message"]
         text = "; ".join(message) if isinstance(message, list) else str(message)
     said = f"Immich answers {status} to {response.request.method} {response.url.path}: {text}"
-    if status in HINTS:
-        kind, hint = HINTS[status]
-        return kind("immich_refused", f"{said}. {hint}")
-    if status == 404 or (status == 400 and text.startswith("Not found or no ")):
-        return NotFound("immich_refused", said)
-    general = response_error(response)
-    retried = isinstance(general, (TooManyRequests, Unavailable))
-    return (type(general) if retried else Unprocessable)("immich_refused", said, **general.extra)
+    if status == 400 and text.startswith("Not found or no "):
+        status = 404
+    problem = {"code": "immich_refused", "detail": f"{said}.{HINTS.get(status, '')}"}
+    headers = {"retry-after": response.headers.get("retry-after", "")}
+    status = 503 if status in (502, 504) else status
+    return response_error(httpx2.Response(status, headers=headers, json=problem))

@@ -18,7 +18,7 @@ from services.cli.locate.library import LibraryPhoto, LocatedPhoto, UndoReport, 
 from services.cli.locate.undo_journal import append_to_journal, read_journal, repair_journal
 from services.cli.output import Json
 from shared.config.private_files import make_private_folder
-from shared.errors import Conflict, Forbidden, NotFound, Unprocessable
+from shared.errors import Conflict, NotFound, PlacewiseError, TooManyRequests, Unavailable
 from shared.imaging.capture_place import is_null_island
 
 NOWHERE: Coordinates = (0.0, 0.0)
@@ -64,7 +64,7 @@ class ImmichLibrary:
             image["id"]: image
             for image in self._api.images()
             if image["ownerId"] == self._user_id
-            and not (image["isTrashed"] or image["visibility"] == "locked")
+            and not (image["isTrashed"] or image.get("visibility") == "locked")
         }
         photos: dict[str, LibraryPhoto] = {}
         for image in own.values():
@@ -104,7 +104,9 @@ class ImmichLibrary:
                 try:
                     if names:
                         self._api.set_coordinates(list(names), position)
-                except (NotFound, Unprocessable, Forbidden) as error:
+                except (Unavailable, TooManyRequests):
+                    raise
+                except PlacewiseError as error:
                     report.skipped.update(dict.fromkeys(names.values(), error.detail))
                 else:
                     report.written.extend(names.values())

@@ -43,7 +43,7 @@ from services.cli.output import (
     printable_text,
     progress_bar,
 )
-from shared.errors import PlacewiseError
+from shared.errors import PlacewiseError, TooManyRequests, Unavailable
 from shared.geotagging.evidence import KnownPosition, TimeNeighbours
 from shared.geotagging.locate import (
     SIMILAR_PHOTOS,
@@ -160,6 +160,11 @@ def _search_photo(
 ) -> SearchedPhoto:
     try:
         picture = library.fetch(photo)
+    except (Unavailable, TooManyRequests):
+        raise
+    except PlacewiseError as error:
+        return SearchedPhoto(error=error.detail)
+    try:
         answer = client.similar(picture, top_k=SIMILAR_PHOTOS, pose=True, history=False)
         if answer.matches_without_place:  # they hide photos with coordinates
             located = client.similar(

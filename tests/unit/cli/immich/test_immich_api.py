@@ -112,8 +112,8 @@ def test_an_edited_picture_has_another_state_and_coordinates_of_zero_are_none(
             Forbidden, "immich_refused", "asset.read. Add it to the API key",
         ),
         (refused(404, "Asset media not found"), NotFound, "immich_refused", "Asset media"),
-        (refused(400, ["a", "b"]), Unprocessable, "immich_refused", "a; b"),
-        ((500, b"<html>", {}), Unprocessable, "immich_refused", "500"),
+        (refused(400, ["a", "b"]), InvalidRequest, "immich_refused", "a; b"),
+        ((500, b"<html>", {}), PlacewiseError, "immich_refused", "500"),
         ((200, b"<html>", {}), Unprocessable, "immich_refused", "Is it the address of Immich?"),
     ],
 )  # fmt: skip
