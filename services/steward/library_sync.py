@@ -99,8 +99,7 @@ def repeat_library_syncs(catalog: Catalog) -> bool:
     """Queue each job of a library again that has ended `every_hours` ago."""
     with catalog.write() as session:
         ended = select(Job).where(
-            Job.kind == JobKind.SYNC_LIBRARY,
-            Job.state.in_((JobState.SUCCEEDED, JobState.FAILED)),
+            Job.kind == JobKind.SYNC_LIBRARY, Job.state.in_((JobState.SUCCEEDED, JobState.FAILED))
         )
         jobs = session.scalars(ended.with_for_update(skip_locked=True))
         scheduled = [job for job in jobs if job.params["every_hours"]]

@@ -58,8 +58,7 @@ def immich(
         ),
     ] = False,
     undo_changes: Annotated[
-        bool,
-        typer.Option("--undo", help="Take back what --write has written into Immich."),
+        bool, typer.Option("--undo", help="Take back what --write has written into Immich.")
     ] = False,
     motion: MotionOption = "walk",
     together: TogetherOption = False,

@@ -23,8 +23,7 @@ AcceptOption = Annotated[
     float, typer.Option(min=0, max=1, help="Probability from which a proposal is accepted.")
 ]
 RadiusOption = Annotated[
-    float,
-    typer.Option(min=10, max=2000, help="Radius in metres that the probability is for."),
+    float, typer.Option(min=10, max=2000, help="Radius in metres that the probability is for.")
 ]
 MotionOption = Annotated[
     str,
@@ -66,12 +65,11 @@ def locate(
         Target | None,
         typer.Option(
             help="Write the accepted proposals: XMP sidecars, EXIF, or a CSV table or GPX "
-            "waypoints in DIR. Without it, nothing is written.",
+            "waypoints in DIR. Without it, nothing is written."
         ),
     ] = None,
     undo_changes: Annotated[
-        bool,
-        typer.Option("--undo", help="Restore all files that --write has changed in DIR."),
+        bool, typer.Option("--undo", help="Restore all files that --write has changed in DIR.")
     ] = False,
     motion: MotionOption = "walk",
     together: TogetherOption = False,

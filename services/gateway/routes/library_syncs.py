@@ -25,10 +25,7 @@ class LibrarySyncRequest(RequestModel):
     """When to repeat it."""
 
     every_hours: int | None = Field(
-        None,
-        ge=1,
-        le=24 * 28,
-        description="hours from the end of a run to the next; null: once",
+        None, ge=1, le=24 * 28, description="hours from the end of a run to the next; null: once"
     )
 
 
