@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,15 @@ from rich.progress import Progress
 from rich.table import Column
 
 from lab.cli.evaluation.describers import checkpoint_describer, extractor_describer
+from lab.cli.evaluation.results import check_output_folders
 from lab.datasets.dataset import EvaluationSet
 from lab.datasets.open_dataset import open_evaluation_set
 from lab.evaluation.exact_knn import exact_knn
 from lab.evaluation.paired_runs import PairedDifference, paired_differences
 from lab.evaluation.query_clusters import cluster_queries
 from lab.evaluation.ranking import DEFAULT_KS, Rows, describe_evaluation_set
+from lab.evaluation.report.charts import recall_comparison
+from lab.evaluation.report.tables import write_figures, write_tables
 from lab.evaluation.results import package_versions
 from lab.evaluation.retrieval_metrics import RetrievalMetrics, compute_metrics
 from services.cli.environment import read_settings
@@ -31,6 +35,7 @@ from services.cli.output import (
     print_message,
     print_table,
     progress_bar,
+    refuse_unwritable,
     stage_bars,
 )
 from shared.config.settings import Settings
@@ -190,17 +195,19 @@ def compare_extractors(
     set_name: str | None,
     protocol: str | None,
     rule: str | None,
+    out: Path | None,
     faiss_gpu: bool,
     as_json: bool,
 ) -> None:
-    """Evaluate each extractor on a data set, and print the comparison.
+    """Evaluate each extractor on a data set, then write and print the comparison.
 
-    Raises InvalidRequest (`bad_extractors`), Unprocessable (a photo can't be described), and errors
-    of opening the data set and loading the extractors.
+    Raises InvalidRequest (`bad_extractors`), Misconfigured (`out_unwritable`), Unprocessable (a
+    photo can't be described), and errors of opening the data set and loading the extractors.
     """
     entries = parse_entries(extractors)
     settings = read_settings()
     _validate_entries(entries, settings)
+    check_output_folders(out)
     evaluation_set = open_evaluation_set(data, set_name, protocol=protocol, rule=rule)
     clusters = cluster_queries(evaluation_set.queries)
     compared: list[ComparedExtractor] = []
@@ -216,6 +223,11 @@ def compare_extractors(
                     measured.within[:, :1], first.within[:, :1], clusters.labels
                 )
             compared.append(ComparedExtractor(entry.spec_text, measured, difference, **properties))
+    if out is not None:
+        measured_by_name = [(each.name, each.measured) for each in compared]
+        with refuse_unwritable(out):
+            write_tables(out, measured_by_name)
+            write_figures(out, evaluation_set.name, [recall_comparison(measured_by_name)])
     if as_json:
         print_json(_comparison_as_json(evaluation_set, compared))
     else:
@@ -257,13 +269,9 @@ def _evaluate_entry(
         )
     )
     on_progress = stage_bars(progress, f"{entry.spec_text}: ")
-    describer.describe.on_lookup = lambda done, total: on_progress(
-        "cached descriptors", done, total
-    )
-    with describe_evaluation_set(describer.describe, evaluation_set, on_progress=on_progress) as (
-        database,
-        queries,
-    ):
+    describer.describe.on_lookup = partial(on_progress, "cached descriptors")
+    with describe_evaluation_set(describer.describe, evaluation_set, on_progress) as rows:
+        database, queries = rows
         milliseconds = describer.describe.milliseconds_a_photo()
         if entry.pca is not None:
             database, queries, projection_ms = whiten_set(
@@ -271,13 +279,9 @@ def _evaluate_entry(
             )
             if milliseconds is not None:
                 milliseconds += projection_ms
-        ranked = exact_knn(
-            queries,
-            database,
-            max(DEFAULT_KS),
-            faiss_gpu=faiss_gpu,
-            on_progress=lambda done, total: on_progress("search", done, total),
-        )
+        search = partial(on_progress, "search")
+        depth = max(DEFAULT_KS)
+        ranked = exact_knn(queries, database, depth, faiss_gpu=faiss_gpu, on_progress=search)
         dimension = database.shape[1]
     measured = compute_metrics(
         ranked.indices,

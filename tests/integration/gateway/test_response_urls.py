@@ -156,6 +156,7 @@ def test_every_url_in_an_answer_leads_to_its_map(service: Service) -> None:
     call.cancel(call("start_generation", "POST", "/generations", json=params))
     call("add_model", "POST", "/models", files=file, data={"name": "one"})
     call("evaluate", "POST", "/evaluations")
+    call.cancel(call("sync_library", "POST", "/library-syncs", json={}))
     call.cancel(call("reconstruct", "POST", "/reconstructions"))
     call.cancel(call("import_reconstruction", "POST", "/reconstructions/import", json=COLMAP))
 

@@ -5,12 +5,13 @@ import { button, fill, h, time } from "../dom.js";
 import { bytes, count, duration, score } from "../format.js";
 import { stateInWords } from "../jobs.js";
 import { serverSettings } from "../settings.js";
+import { drawLibrary } from "./library.js";
 import { judge, measurementInWords } from "./verdict.js";
 
 const LOOK_SECONDS = 5;
 
 export async function showStatus(view, { signal }) {
-  const drawn = { health: h("section", { class: "card" }), figures: h("section", { class: "card" }), jobs: h("section", { class: "card" }), searches: h("section", { class: "card" }) };
+  const drawn = { health: h("section", { class: "card" }), figures: h("section", { class: "card" }), library: h("section", { class: "card", hidden: true }), jobs: h("section", { class: "card" }), searches: h("section", { class: "card" }) };
   const settings = await serverSettings();
   const look = async () => {
     const [health, stats, map, { jobs }, { searches }] = await Promise.all([
@@ -22,13 +23,14 @@ export async function showStatus(view, { signal }) {
     const failed = stats.failed_images ? (await get("/search", { query: { failed: true, limit: 12 }, signal })).images : [];
     drawFigures(drawn.figures, stats, map, failed, look);
     drawJobs(drawn.jobs, jobs, look);
+    await drawLibrary(drawn.library, signal);
     drawSearches(drawn.searches, searches);
   };
   await look();
   fill(view, h("header", { class: "head" }, h("h1", {}, "Status"), h("p", { class: "row" }, h("a", { class: "button", href: "/docs" }, "The API"))), h("div", { class: "status-grid" }, Object.values(drawn), phoneCard(settings)));
   const timer = setInterval(() => {
     // Not while someone is at a button of what would be drawn anew.
-    if (!document.hidden && ![drawn.jobs, drawn.figures].some((card) => card.contains(document.activeElement))) look().catch((error) => !signal.aborted && drawUnreachable(drawn.health, error));
+    if (!document.hidden && ![drawn.jobs, drawn.figures, drawn.library].some((card) => card.contains(document.activeElement))) look().catch((error) => !signal.aborted && drawUnreachable(drawn.health, error));
   }, LOOK_SECONDS * 1000);
   signal.addEventListener("abort", () => clearInterval(timer));
 }
