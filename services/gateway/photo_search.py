@@ -24,7 +24,7 @@ from shared.catalog.database.base import (
     json_array_has,
     json_array_has_part,
 )
-from shared.catalog.photos import Photo, PhotoRole, is_geotagged
+from shared.catalog.photos import Photo, PhotoRole, has_given_place, is_geotagged
 from shared.geodesy import latitude_bounds, longitude_half_width
 from shared.place_paths import PATH_SEPARATOR
 from shared.search_api.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
@@ -50,6 +50,10 @@ class MetadataFilter:
     role: PhotoRole | None = None
     failed: bool = False
     """Whether the photo's description has to have failed."""
+    without_place: bool = False
+    """Whether the photo must have neither coordinates nor a label."""
+    place_given: bool = False
+    """Whether the photo's place must have been given here."""
 
     def conditions(self, photo: type[Photo] = Photo, *, trigrams: bool) -> list[Condition]:
         """Return the SQL conditions; `trigrams` if the catalog has a trigram index (PostgreSQL)."""
@@ -72,6 +76,10 @@ class MetadataFilter:
             conditions.append(photo.size_bytes <= self.max_file_size)
         if self.role is not None:
             conditions.append(photo.role == self.role)
+        if self.without_place:
+            conditions.append(~is_geotagged(photo))
+        if self.place_given:
+            conditions.append(has_given_place(photo))
         return conditions + filter_conditions(self.photos, photo)
 
 

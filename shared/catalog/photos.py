@@ -41,7 +41,8 @@ class Photo(Journaled, Base):
     `job_id` is the job that describes the photo; the photo is searchable if it has a row in
     `descriptors`. `altitude` is in metres, above the sea where its source says so; `focal_length`
     is a multiple of the longer side. `changed_version` is the map's version at the last change that
-    affects searches.
+    affects searches. `given_place` is the journal of a place that the photo was given here: the
+    `former` and the `written` values by column, `probability`, `reason` and `given_at`.
     """
 
     __tablename__ = "photos"
@@ -67,9 +68,11 @@ class Photo(Journaled, Base):
     heading: Mapped[float | None] = mapped_column(sa.Float)
     focal_length: Mapped[float | None] = mapped_column(sa.Float)
     captured_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    capture: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)  # of `describe_capture`
     place: Mapped[str | None] = mapped_column(sa.Text)
     tags: Mapped[list[str]] = mapped_column(JsonValue, default=list)
     attributes: Mapped[dict[str, Any]] = mapped_column("metadata", JsonValue, default=dict)
+    given_place: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
     uploaded_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     changed_version: Mapped[int] = mapped_column(sa.BigInteger, default=0)
@@ -142,6 +145,12 @@ class Photo(Journaled, Base):
         ).ddl_if(dialect="postgresql"),
         partial_index("ix_photos_deleted", "deleted_at", only=deleted_at.is_not(None)),
     )
+
+    @property
+    def place_is_as_given(self) -> bool:
+        """Whether the photo has the place that it was given, and not another one since."""
+        written = self.given_place["written"] if self.given_place else {}
+        return all(getattr(self, name) == value for name, value in written.items())
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,6 +244,11 @@ def count_live_photos(session: Session, map_id: UUID, role: PhotoRole | None = N
 def has_live_photo(session: Session, map_id: UUID, role: PhotoRole) -> bool:
     """Return whether the map has a live photo of the role."""
     return session.scalar(select_live_photos(map_id, role).limit(1)) is not None
+
+
+def has_given_place(photo: type[Photo] = Photo) -> Condition:
+    """Condition for photos whose place was given here, not sent with them."""
+    return photo.given_place.is_not(None)
 
 
 def is_geotagged(photo: type[Photo] = Photo) -> Condition:

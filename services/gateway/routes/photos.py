@@ -134,6 +134,9 @@ def patch_photo(
         for name, value in columns.items():
             setattr(photo, name, value)
         photo.latitude, photo.longitude = coordinate_pair(photo.latitude, photo.longitude)
+        if columns.get("captured_at") is not None:  # UTC
+            utc = {"time_zone_is_known": True, "clock_offset_seconds": None}
+            photo.capture = {**(photo.capture or {}), **utc}
         photo.changed_version = increment_map_version(session, map_.id)
         session.flush()
         return _photo_detail_response(session, photo, query.map)
@@ -303,6 +306,12 @@ class MetadataSearchParams(FilterParams, PageParams):
     failed: bool = Field(
         False, description="photos that can't be searched for, because their description failed"
     )
+    without_place: bool = Field(
+        False, description="photos that have neither coordinates nor a place label"
+    )
+    place_given: bool = Field(
+        False, description="photos whose place was given with `POST /places`, and not undone"
+    )
     limit: int = Field(100, ge=1, le=1000)
 
     def metadata_filter(self) -> MetadataFilter:
@@ -318,6 +327,8 @@ class MetadataSearchParams(FilterParams, PageParams):
             photos=self.photo_filter(),
             role=self.role,
             failed=self.failed,
+            without_place=self.without_place,
+            place_given=self.place_given,
         )
 
 

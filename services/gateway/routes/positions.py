@@ -53,11 +53,13 @@ Name = Annotated[str, Field(max_length=MAX_NAME)]
 ClockOffset = Annotated[timedelta, Field(ge=timedelta(days=-1), le=timedelta(days=1))]
 
 
-class _Finite(RequestModel):
+class FiniteModel(RequestModel):
+    """A body whose numbers are finite."""
+
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
-class SimilarBody(_Finite):
+class SimilarBody(FiniteModel):
     """A photo of the map that looks similar."""
 
     name: Name
@@ -66,7 +68,7 @@ class SimilarBody(_Finite):
     score: float = Field(ge=-10, le=10)
 
 
-class CircleBody(_Finite):
+class CircleBody(FiniteModel):
     """A level of the estimate."""
 
     latitude: Latitude
@@ -75,7 +77,7 @@ class CircleBody(_Finite):
     probability: Probability
 
 
-class PoseBody(_Finite):
+class PoseBody(FiniteModel):
     """The pose that a search found, if it has coordinates."""
 
     latitude: Latitude
@@ -84,7 +86,7 @@ class PoseBody(_Finite):
     heading: float = Field(ge=0, le=360)
 
 
-class SearchBody(_Finite):
+class SearchBody(FiniteModel):
     """What a similarity search answered for the photo."""
 
     similar: list[SimilarBody] = Field(max_length=MAX_SIMILAR, description="best first")
@@ -94,7 +96,7 @@ class SearchBody(_Finite):
     headline: str = Field("", max_length=MAX_NAME, description="of the estimate")
 
 
-class DatedPhotoBody(_Finite):
+class DatedPhotoBody(FiniteModel):
     """A photo of a folder, with or without coordinates."""
 
     name: Name
@@ -118,13 +120,13 @@ class DatedPhotoBody(_Finite):
         return coordinate_pair(self.latitude, self.longitude)
 
 
-class TrackPointBody(_Finite):
+class TrackPointBody(FiniteModel):
     time: AwareDatetime
     latitude: Latitude
     longitude: Longitude
 
 
-class ProposalOptions(_Finite):
+class ProposalOptions(FiniteModel):
     """What is known beside the photos."""
 
     track: FailFastList[TrackPointBody] = Field(
