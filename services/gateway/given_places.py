@@ -221,23 +221,24 @@ def _propose_place(
     finder: PositionFinder,
     photo_count: int,
 ) -> StoredProposalResponse:
-    answer, picture, error, label = None, None, None, (None, None)
+    answer, picture, error, label, probability = None, None, None, None, None
     try:
         answer = search_for_place(gateway, map_name, photo)
     except Conflict as problem:  # it is not described yet, or can't be
         error = problem.detail
     if answer is not None:
         picture = picture_evidence(answer, photo_count)
-        label = probable_label(answer.estimate)
+        label, probability = probable_label(answer.estimate)
     proposal, reason = finder.propose(dated, picture)
     if gps_error := (photo.capture or {}).get("gps_error"):
-        proposal, label, error = None, (None, None), f"It may have coordinates: {gps_error}"
+        proposal, label, probability = None, None, None
+        error = f"It may have coordinates: {gps_error}"
     return StoredProposalResponse(
         **proposal_fields(dated.name, proposal, reason, finder.radius_m),
         photo=photo_response(PhotoResponse, photo, map_name),
-        place=label[0],
-        place_probability=label[1],
-        looks_like=similar_at(answer, proposal, label[0]) if answer else None,
+        place=label,
+        place_probability=probability,
+        looks_like=similar_at(answer, proposal, label) if answer else None,
         error=error,
     )
 

@@ -140,7 +140,8 @@ def read_geotagged_photos(
         GeotaggedPhoto(
             row[0],
             PhotoLocation(*row[1:4]),
-            *row[4:6],
+            row[4],
+            row[5],
             place_is_estimated=bool(row[6]) and row[6]["probability"] is not None,
         )
         for row in photos

@@ -7,6 +7,7 @@ import { count, nameOf, percent, plural, score, strength, whereabouts } from "..
 import { stateInWords, watchJob } from "../jobs.js";
 import { localPicture, mayNeedPreview, preview, thumbnail } from "../photo.js";
 import { shrinkPhoto } from "../shrink.js";
+import { corrections, giveByHand, keepAsTestPhoto } from "./correct.js";
 import { drawPose, seenPoints } from "./pose.js";
 import { drawRings, judge, measurementInWords, verdict } from "./verdict.js";
 
@@ -24,6 +25,8 @@ export async function showAsk(view, { signal, id }) {
       name: nameOf(photo),
       picture: () => preview(photo, `The query photo: ${nameOf(photo)}`),
       find: (query, onjob) => findSimilar(`/similarity/${id}`, query, null, onjob, signal),
+      // Of a photo with a place, the map knows how right the answer is.
+      keep: photo.latitude === null && photo.place === null ? (place) => giveByHand(id, place) : null,
     };
     fill(view, h("h1", {}, "Which photos show this place?"), answer);
     await showAnswer(answer, queryPhoto, signal);
@@ -37,6 +40,7 @@ export async function showAsk(view, { signal, id }) {
     const queryPhoto = {
       name: file.name,
       picture: () => localPicture(file, { alt: `The query photo: ${file.name}` }, shown),
+      keep: (place) => keepAsTestPhoto(file, place),
       find: async (query, onjob) => {
         const sent = await small;
         // A copy has no EXIF; it is answered all the same if that of the original can't be read.
@@ -175,7 +179,7 @@ async function showAnswer(answer, queryPhoto, signal) {
   fill(answer,
     h("section", { class: "result" },
       h("figure", { class: "query-photo" }, queryPhoto.picture(), seenPoints(found.pose), h("figcaption", {}, queryPhoto.name)),
-      h("div", { class: "verdict-column" }, verdict(found, measurement)),
+      h("div", { class: "verdict-column" }, verdict(found, measurement), queryPhoto.keep && corrections(found, queryPhoto.keep, signal)),
       located ? ground : null),
     h("section", {},
       h("h2", { class: "matches-title" }, photos.length ? "Most similar photos" : "No photo found"),

@@ -6,7 +6,10 @@ import { bytes, degrees, nameOf, when } from "../format.js";
 import { openMap } from "../map.js";
 import { preview } from "../photo.js";
 import { coordinateTools } from "../places.js";
+import { givenInWords, undoPlaces } from "./places.js";
 import { readTags } from "./photos.js";
+
+const LOOKALIKES = 5;
 
 export async function showPhoto(view, { signal, id }) {
   const photo = await get(`/uploads/${id}`, { signal });
@@ -31,7 +34,7 @@ export async function showPhoto(view, { signal, id }) {
       h("div", { class: "beside" },
         h("section", { class: "card" }, form.element),
         h("section", { class: "card" }, ground, h("p", { class: "soft small" }, "Click into the map to move the photo there, then save.")),
-        h("section", { class: "card" }, facts(photo, job)))));
+        h("section", { class: "card" }, facts(photo, job, () => window.dispatchEvent(new HashChangeEvent("hashchange")))))));
   const map = await openMap(ground, "Where this photo was taken; click to move it", { onpick: (latitude, longitude) => {
     form.setPoint(latitude, longitude);
     draw();
@@ -48,14 +51,26 @@ export async function showPhoto(view, { signal, id }) {
   };
   form.element.addEventListener("input", () => draw());
   draw(true);
+  if (photo.latitude === null && photo.searchable) await showLookalikes(map, id, signal);
 }
 
-function facts(photo, job) {
+/** The map of a photo without coordinates opens where its look-alikes are. */
+async function showLookalikes(map, id, signal) {
+  const { similar_images: similar } = await get(`/similarity/${id}`, { method: "POST", query: { top_k: LOOKALIKES, box: "-90,-180,90,180", history: false }, signal });
+  for (const { latitude, longitude, ...one } of similar) map.point(latitude, longitude, { kind: "behind", text: `Looks like ${nameOf(one)}` });
+  map.fit();
+}
+
+function facts(photo, job, reload) {
   const state = photo.role === "query" ? "no: a test photo" : photo.searchable ? "yes" : "not yet";
   const line = (name, value) => [h("dt", {}, name), h("dd", {}, value)];
   return h("dl", { class: "facts" },
     line("Searchable", job?.state === "failed" ? h("span", { class: "bad" }, `no. ${job.error.detail}`) : state),
     photo.latitude !== null && line("Position", [degrees(photo.latitude, photo.longitude), coordinateTools(photo.latitude, photo.longitude)]),
+    photo.given_place && line("Given", [givenInWords(photo), " ", button("Undo", async () => {
+      await undoPlaces([photo.image_id]);
+      reload();
+    }, "link")]),
     line("Size", `${photo.width} × ${photo.height}, ${bytes(photo.file_size)}`),
     line("Taken", photo.captured_at ? when(photo.captured_at) : "not known"),
     line("Added", time(photo.upload_time)),

@@ -5,6 +5,7 @@ import { button, confirmed, field, fill, h, note, noteError, openDialog, time } 
 import { count, nameOf, plural, whereabouts } from "../format.js";
 import { openMap } from "../map.js";
 import { thumbnail } from "../photo.js";
+import { unplacedCard } from "./places.js";
 
 const PAGE = 48;
 const ON_THE_MAP = 1000; // the API's largest page
@@ -18,6 +19,7 @@ export async function showPhotos(view, { signal }) {
   const ground = h("div", { class: "ground browse", hidden: true });
   const cut = h("p", { class: "soft small", hidden: true });
   const tools = h("div", { class: "tools", hidden: true });
+  const unplaced = h("div", {});
   let opening = null;
 
   const { form, query, setNear } = filterForm(reload);
@@ -30,7 +32,8 @@ export async function showPhotos(view, { signal }) {
   mapButton.setAttribute("aria-expanded", "false");
   fill(view,
     h("header", { class: "head" }, h("h1", {}, "Photos"), h("div", { class: "row" }, mapButton, h("a", { class: "button primary", href: "#/add" }, "Add photos"))),
-    form, ground, cut, total, tools, grid, more);
+    unplaced, form, ground, cut, total, tools, grid, more);
+  unplacedCard(signal).then((card) => fill(unplaced, card), (error) => !signal.aborted && noteError(error));
 
   async function reload() {
     chosen.clear();
@@ -159,6 +162,7 @@ function filterForm(onchange) {
   const after = h("input", { type: "date" });
   const before = h("input", { type: "date" });
   const role = h("select", {}, h("option", { value: "" }, "All"), h("option", { value: "database" }, "Can be found"), h("option", { value: "query" }, "Test photos"));
+  const without = h("input", { type: "checkbox" });
   let timer;
   const changed = () => {
     clearTimeout(timer);
@@ -166,6 +170,7 @@ function filterForm(onchange) {
   };
   const form = h("form", { class: "filters card", role: "search", "aria-label": "Filter the photos", oninput: changed, onsubmit: (event) => event.preventDefault() },
     field("Name", name), field("Tags", tags),
+    h("label", { class: "check" }, without, h("span", {}, "Without a place")),
     h("details", {}, h("summary", {}, "More filters"), h("div", { class: "filters-more" },
       field("Near", near, "Or click into the map"), field("Within metres", radius),
       field("Taken from", after), field("Taken until", before), field("Use", role))));
@@ -178,6 +183,7 @@ function filterForm(onchange) {
       captured_after: after.value,
       captured_before: before.value && `${before.value}T23:59:59`,
       role: role.value,
+      without_place: without.checked || "",
     }),
     setNear: (latitude, longitude) => {
       near.value = `${latitude.toFixed(6)}, ${longitude.toFixed(6)}`;
