@@ -100,8 +100,8 @@ def read_dated_photos(
     A place that was given by a proposal is none: it would count twice what that rested on.
     """
     hours = timedelta(hours=CLOCK_HOURS)
-    times = sorted(photo.captured_at for photo in photos if photo.captured_at is not None)
-    same_hours = [Photo.captured_at.between(*span) for span in _spans(times, hours)]
+    times = [photo.captured_at for photo in photos if photo.captured_at is not None]
+    same_hours = [Photo.captured_at.between(time - hours, time + hours) for time in times]
     rows = session.execute(
         select(
             Photo.id,
@@ -122,17 +122,6 @@ def read_dated_photos(
     ).all()
     dated = add_time_zones([_dated_photo(*row[1:]) for row in rows])
     return {row[0]: photo for row, photo in zip(rows, dated, strict=True)}
-
-
-def _spans(times: Sequence[datetime], around: timedelta) -> list[tuple[datetime, datetime]]:
-    """Return the intervals around sorted times, those that overlap as one."""
-    spans: list[tuple[datetime, datetime]] = []
-    for time in times:
-        begin = time - around
-        if spans and begin <= spans[-1][1]:
-            begin = spans.pop()[0]
-        spans.append((begin, time + around))
-    return spans
 
 
 def _dated_photo(
@@ -176,21 +165,14 @@ def search_for_place(gateway: GatewayContext, map_name: str, photo: Photo) -> Si
     return answer
 
 
-def similar_at(
-    answer: SimilarityResponse, proposal: Proposal | None, label: str | None
-) -> SimilarPhotoResponse | None:
-    """Return the most similar photo that a proposal or a label rests on, if there is one."""
-    for photo in answer.similar_images:
-        if proposal is None:
-            if label is not None and photo.place == label:
-                return photo
-        elif photo.latitude is not None and photo.longitude is not None:
-            away = distance_m(
-                proposal.latitude, proposal.longitude, photo.latitude, photo.longitude
-            )
-            if away <= proposal.radius_m:
-                return photo
-    return None
+def _is_at(photo: SimilarPhotoResponse, proposal: Proposal | None, label: str | None) -> bool:
+    """Return whether a photo has a place that a proposal, or else a label, speaks of."""
+    if proposal is None:
+        return label is not None and photo.place == label
+    if photo.latitude is None or photo.longitude is None:
+        return False
+    to = (photo.latitude, photo.longitude)
+    return distance_m(proposal.latitude, proposal.longitude, *to) <= proposal.radius_m
 
 
 def propose_places(
@@ -221,13 +203,14 @@ def _propose_place(
     finder: PositionFinder,
     photo_count: int,
 ) -> StoredProposalResponse:
-    answer, picture, error, label, probability = None, None, None, None, None
+    picture, error, label, probability = None, None, None, None
+    similar: Sequence[SimilarPhotoResponse] = ()
     try:
         answer = search_for_place(gateway, map_name, photo)
     except Conflict as problem:  # it is not described yet, or can't be
         error = problem.detail
-    if answer is not None:
-        picture = picture_evidence(answer, photo_count)
+    else:
+        picture, similar = picture_evidence(answer, photo_count), answer.similar_images
         label, probability = probable_label(answer.estimate)
     proposal, reason = finder.propose(dated, picture)
     if gps_error := (photo.capture or {}).get("gps_error"):
@@ -238,7 +221,7 @@ def _propose_place(
         photo=photo_response(PhotoResponse, photo, map_name),
         place=label,
         place_probability=probability,
-        looks_like=similar_at(answer, proposal, label) if answer else None,
+        looks_like=next((each for each in similar if _is_at(each, proposal, label)), None),
         error=error,
     )
 

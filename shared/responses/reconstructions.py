@@ -99,11 +99,11 @@ class ProposalResponse(ResponseModel):
     """Where a photo was probably taken."""
 
     name: str
-    latitude: float | None = Field(description="null if nothing is known about its place")
-    longitude: float | None
+    latitude: float | None = Field(None, description="null if nothing is known about its place")
+    longitude: float | None = None
     radius_m: float
     probability: float = Field(description="that it was taken within `radius_m`")
-    radius_68_m: float | None
+    radius_68_m: float | None = None
     heading: float | None = Field(
         None, description="degrees clockwise from north; null unless the proposal rests on a pose"
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from dataclasses import asdict
 from datetime import timedelta
 from typing import Annotated, Any, Literal, Self
 
@@ -229,16 +230,9 @@ def proposal_fields(
     name: str, proposal: Proposal | None, reason: str, radius_m: float
 ) -> dict[str, Any]:
     """Return the fields of a `ProposalResponse`."""
-    return {
-        "name": name,
-        "latitude": proposal.latitude if proposal else None,
-        "longitude": proposal.longitude if proposal else None,
-        "radius_m": radius_m,
-        "probability": proposal.probability if proposal else 0.0,
-        "radius_68_m": proposal.radius_68_m if proposal else None,
-        "heading": proposal.heading if proposal else None,
-        "reason": reason,
-    }
+    if proposal is None:
+        return {"name": name, "radius_m": radius_m, "probability": 0.0, "reason": reason}
+    return {"name": name, **asdict(proposal)}
 
 
 def _picture_evidence(search: SearchBody | None, photo_count: int) -> PictureEvidence | None:

@@ -115,9 +115,10 @@ export async function showPlaces(view, { signal }) {
       proposals.push(...page.proposals);
       fill(progress, cursor && [h("p", { class: "soft" }, `Looking at ${count(proposals.length)} of ${plural(total, "photo")}`), bar("Looking for places", proposals.length, total)]);
       draw();
+      await drawMap();
     } while (cursor);
     announce(words.textContent);
-    drawMap();
+    map?.fit();
   }
 
   const isSure = (proposal) => placeOf(proposal) && surety(proposal) >= Number(least.value) / 100;
@@ -198,10 +199,12 @@ export async function showPlaces(view, { signal }) {
 
   async function drawMap() {
     const located = proposals.filter(({ latitude }) => latitude !== null);
-    if (!located.length || map) return;
+    if (!located.length || !ground.hidden) return;
     ground.hidden = beforeButton.hidden = false;
-    map = await openMap(ground, "Before: the photos with a place. After: the proposals, by their numbers", { signal });
+    const opened = await openMap(ground, "Before: the photos with a place. After: the proposals, by their numbers", { signal });
     known = (await get("/search", { query: { box: "-90,-180,90,180", limit: KNOWN_ON_MAP }, signal })).images;
+    map = opened;
+    signal.throwIfAborted();
     draw();
     map.fit();
   }
