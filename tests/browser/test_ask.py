@@ -66,6 +66,7 @@ def test_each_level_and_each_match_has_its_probability(
         values = rows.locator("meter").evaluate_all("meters => meters.map(meter => meter.value)")
         assert values == shares
         assert sum(values) == 100
+        page.locator(".verdict summary").click()
         name = "Probability: Within 25 m"
         expect(page.get_by_role("meter", name=name)).to_be_visible()
     expect(page.locator(".match")).to_have_count(len(matches))
@@ -364,6 +365,8 @@ def test_a_match_is_shown_beside_the_photo_with_lines_between_their_points(
     expect(dialog.get_by_role("status")).to_have_text(caption)
     expect(dialog.get_by_role("img", name=caption)).to_be_visible()
     lines = dialog.locator(".lines line")
+    expect(lines).to_have_count(min(points, 30))
+    dialog.get_by_label("Lines").select_option("at most 150")
     expect(lines).to_have_count(min(points, 150))
     left, right = (dialog.locator(".frame img").nth(side).bounding_box() for side in (0, 1))
     assert left
@@ -379,6 +382,9 @@ def test_a_match_is_shown_beside_the_photo_with_lines_between_their_points(
         for (x, y), photo in zip(ends, (left, right), strict=True):
             assert photo["x"] - 1 <= x <= photo["x"] + photo["width"] + 1
             assert photo["y"] - 1 <= y <= photo["y"] + photo["height"] + 1
+    dialog.get_by_label("Lines").select_option("none")
+    expect(lines).to_have_count(0)
+    dialog.get_by_role("heading").focus()
     page.keyboard.press("ArrowRight")
     expect(dialog.get_by_role("heading")).to_have_text("Match 2 of 12")
     expect(dialog.get_by_role("status")).to_contain_text("points of both photos match")
@@ -400,5 +406,6 @@ def test_an_empty_map_says_what_to_do_next(visitor: Visitor) -> None:
     page.goto(visitor.url)
     page.evaluate("localStorage.setItem('placewise-map', 'default')")
     visitor.visit("ask")
-    page.get_by_role("link", name="Add some first").click()
+    expect(page.get_by_text("by comparing it with photos whose place is known")).to_be_visible()
+    page.get_by_role("link", name="Add photos").click()
     expect(page.get_by_role("heading", name="Add photos")).to_be_visible()
