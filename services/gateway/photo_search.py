@@ -24,7 +24,7 @@ from shared.catalog.database.base import (
     json_array_has,
     json_array_has_part,
 )
-from shared.catalog.photos import Photo, PhotoRole, has_given_place, is_geotagged
+from shared.catalog.photos import Photo, PhotoRole, has_given_place, is_geotagged, is_removed
 from shared.geodesy import latitude_bounds, longitude_half_width
 from shared.place_paths import PATH_SEPARATOR
 from shared.search_api.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
@@ -54,6 +54,8 @@ class MetadataFilter:
     """Whether the photo must have neither coordinates nor a label."""
     place_given: bool = False
     """Whether the photo's place must have been given here."""
+    removed: bool = False
+    """Whether the photo must be in the trash, instead of live."""
 
     def conditions(self, photo: type[Photo] = Photo, *, trigrams: bool) -> list[Condition]:
         """Return the SQL conditions; `trigrams` if the catalog has a trigram index (PostgreSQL)."""
@@ -119,7 +121,7 @@ def search_photos(
     limit: int,
     after: tuple[datetime, UUID] | None,
 ) -> tuple[list[Photo], int]:
-    """Search the live photos of a map, newest first.
+    """Search the live photos of a map, or those in its trash, newest first.
 
     Args:
         after: Cursor: upload time and id of the last photo of the previous page.
@@ -128,7 +130,8 @@ def search_photos(
         A page of photos, and the total number of matches, counted up to MAX_COUNTED_MATCHES.
     """
     on_postgres = session.get_bind().dialect.name == "postgresql"
-    live = [Photo.map_id == map_id, Photo.deleted_at.is_(None)]
+    is_there = is_removed() if metadata_filter.removed else Photo.deleted_at.is_(None)
+    live = [Photo.map_id == map_id, is_there]
     if metadata_filter.failed:
         live.append(Photo.id.in_(select_failed_photos(map_id)))
     conditions = [*live, *metadata_filter.conditions(trigrams=on_postgres)]

@@ -25,6 +25,7 @@ from shared.catalog.database.base import (
     UtcDateTime,
     count_rows,
     db_now,
+    db_now_plus,
     filename_trigrams,
     partial_index,
 )
@@ -75,6 +76,7 @@ class Photo(Journaled, Base):
     given_place: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
     uploaded_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    purge_at: Mapped[datetime | None] = mapped_column(UtcDateTime)  # deleted: its objects go then
     changed_version: Mapped[int] = mapped_column(sa.BigInteger, default=0)
     key_id: Mapped[UUID | None] = mapped_column(sa.Uuid)  # the API key of the upload, if any
 
@@ -183,11 +185,14 @@ class PhotoFilterValues:
         return self.deleted_at is None and self.role == PhotoRole.DATABASE
 
 
-def get_photo(session: Session, map_id: UUID, photo_id: UUID) -> Photo:
-    """Return a live photo of the map; NotFound (`photo_not_found`)."""
+def get_photo(session: Session, map_id: UUID, photo_id: UUID, *, or_removed: bool = False) -> Photo:
+    """Return a live photo of the map, or also one in the trash; NotFound (`photo_not_found`)."""
+    is_there = Photo.deleted_at.is_(None)
     photo = session.scalar(
         sa.select(Photo).where(
-            Photo.id == photo_id, Photo.map_id == map_id, Photo.deleted_at.is_(None)
+            Photo.id == photo_id,
+            Photo.map_id == map_id,
+            sa.or_(is_there, is_removed()) if or_removed else is_there,
         )
     )
     if photo is None:
@@ -256,12 +261,25 @@ def is_geotagged(photo: type[Photo] = Photo) -> Condition:
     return sa.or_(photo.latitude.is_not(None), photo.place.is_not(None))
 
 
-def mark_photo_deleted(session: Session, photo: Photo, version: int) -> None:
-    """Hide the photo from all responses from this commit on; its objects are deleted later."""
+def is_removed() -> Condition:
+    """Condition for deleted photos whose objects are kept for now: the trash."""
+    return sa.and_(Photo.deleted_at.is_not(None), Photo.purge_at > db_now())
+
+
+def mark_photo_deleted(
+    session: Session, photo: Photo, version: int, kept_days: float = 0.0
+) -> None:
+    """Hide the photo from all responses from this commit on; its objects are deleted later.
+
+    Args:
+        kept_days: How long the photo stays in the trash.
+    """
     session.execute(
         sa.update(Photo)
         .where(Photo.id == photo.id)
-        .values(deleted_at=db_now(), changed_version=version)
+        .values(
+            deleted_at=db_now(), purge_at=db_now_plus(kept_days * 86_400), changed_version=version
+        )
     )
 
 

@@ -70,7 +70,7 @@ def test_the_map_shows_where_photos_are_and_takes_a_point(visitor: Visitor) -> N
     visitor.expect_no_error()
 
 
-def test_chosen_photos_are_tagged_and_deleted(visitor: Visitor, city: CityServer) -> None:
+def test_chosen_photos_are_tagged_removed_and_restored(visitor: Visitor, city: CityServer) -> None:
     ids = bring_in(city, "tagged-one.jpg", "tagged-two.jpg")
     page = visitor.visit("photos")
     page.get_by_label("Name").fill("tagged-")
@@ -84,13 +84,12 @@ def test_chosen_photos_are_tagged_and_deleted(visitor: Visitor, city: CityServer
     assert city.get(f"/uploads/{ids[0]}")["tags"] == ["first", "second", "third"]
 
     page.get_by_role("checkbox").first.check()
-    page.get_by_role("button", name="Delete…").click()
-    page.get_by_role("button", name="Keep").click()
-    expect(page.locator(".photo-card")).to_have_count(2)
-    page.get_by_role("button", name="Delete…").click()
-    page.get_by_role("button", name="Delete", exact=True).click()
+    page.get_by_role("button", name="Remove").click()
     expect(page.locator(".photo-card")).to_have_count(1)
     assert city.get("/search", filename="tagged-")["total_found"] == 1
+    page.locator(".note").get_by_role("button", name="Undo").click()
+    expect(page.locator(".photo-card")).to_have_count(2)
+    assert city.get("/search", filename="tagged-")["total_found"] == 2
 
 
 def test_a_photo_is_moved_and_named_and_shows_no_rounding_errors(
@@ -118,11 +117,28 @@ def test_a_photo_is_moved_and_named_and_shows_no_rounding_errors(
     expect(page.locator(".photo-name").first).to_have_text("Harbour <b>wall</b>")
 
 
-def test_a_photo_is_deleted_from_its_own_page(visitor: Visitor, city: CityServer) -> None:
+def test_a_removed_photo_is_restored_from_the_trash_or_deleted_for_good(
+    visitor: Visitor, city: CityServer
+) -> None:
     (photo_id,) = bring_in(city, "gone.jpg")
     page = visitor.visit(f"photo/{photo_id}")
-    page.get_by_role("button", name="Delete…").click()
-    page.get_by_role("button", name="Delete", exact=True).click()
+    page.get_by_role("button", name="Remove").click()
     expect(page.get_by_role("heading", name="Photos")).to_be_visible()
     gone = city.server.client.get(f"/api/v1/uploads/{photo_id}", params={"map": MAP})
     assert gone.status_code == 404
+
+    page.get_by_role("link", name="Trash").click()
+    card = page.locator(".photo-card", has_text="gone.jpg")
+    card.get_by_role("button", name="Restore").click()
+    expect(card).to_have_count(0)
+    assert city.get(f"/uploads/{photo_id}")["latitude"] == 44.0
+
+    city.server.client.delete(f"/api/v1/uploads/{photo_id}", params={"map": MAP})
+    visitor.visit("trash")
+    card.get_by_role("button", name="Delete for good…").click()
+    page.get_by_role("button", name="Keep").click()
+    expect(card).to_have_count(1)
+    card.get_by_role("button", name="Delete for good…").click()
+    page.get_by_role("button", name="Delete for good", exact=True).click()
+    expect(card).to_have_count(0)
+    assert city.get("/search", removed=True, filename="gone")["total_found"] == 0

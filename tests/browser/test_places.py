@@ -33,7 +33,8 @@ def unplaced(city: CityServer, tmp_path: Path) -> Iterator[list[str]]:
         ids.append(answer.json()["file_id"])
     yield ids
     for file_id in ids:
-        city.server.client.delete(f"/api/v1/uploads/{file_id}", params={"map": MAP})
+        params = {"map": MAP, "permanently": True}
+        city.server.client.delete(f"/api/v1/uploads/{file_id}", params=params)
 
 
 def position(city: CityServer, file_id: str) -> Any:

@@ -23,6 +23,7 @@ from services.gateway.dependencies import (
     FileId,
     GatewayContext,
     GatewayDep,
+    MapParams,
     MapQuery,
     PageParams,
     invalid_cursor_error,
@@ -38,8 +39,14 @@ from shared.catalog.chunks import find_descriptor
 from shared.catalog.generations import active_generation
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import get_map, increment_map_version, lock_map
-from shared.catalog.photos import Photo, PhotoRole, get_photo, mark_photo_deleted
-from shared.errors import NotFound, invalid_field_error
+from shared.catalog.photos import (
+    Photo,
+    PhotoRole,
+    find_same_photo,
+    get_photo,
+    mark_photo_deleted,
+)
+from shared.errors import Conflict, NotFound, invalid_field_error
 from shared.http.request_model import RequestModel
 from shared.imaging.capture_place import MAX_ALTITUDE_M
 from shared.imaging.file_formats import needs_preview
@@ -142,21 +149,69 @@ def patch_photo(
         return _photo_detail_response(session, photo, query.map)
 
 
+class DeletePhotoParams(MapParams):
+    permanently: bool = Field(False, description="delete its bytes within seconds, for good")
+
+
 @router.delete("/uploads/{file_id}", operation_id="delete_photo", dependencies=[WRITE])
-def delete_photo(gateway: GatewayDep, file_id: FileId, query: MapQuery) -> DeletedPhotoResponse:
-    """Delete a photo. No search returns it any more; its bytes are deleted within seconds."""
+def delete_photo(
+    gateway: GatewayDep, file_id: FileId, query: Annotated[DeletePhotoParams, Query()]
+) -> DeletedPhotoResponse:
+    """Delete a photo. No search returns it any more.
+
+    It can be restored for REMOVED_PHOTO_DAYS, unless it is deleted `permanently`, which a photo in
+    the trash can be, too. Its bytes are deleted then.
+    """
+    days = 0.0 if query.permanently else gateway.settings.removed_photo_days
 
     def remove(session: Session) -> str:
         map_ = lock_map(session, get_map(session, query.map).id)
-        photo = get_photo(session, map_.id, file_id)
-        mark_photo_deleted(session, photo, increment_map_version(session, map_.id))
+        photo = get_photo(session, map_.id, file_id, or_removed=query.permanently)
+        mark_photo_deleted(session, photo, increment_map_version(session, map_.id), days)
         cancel_jobs(session, Job.photo_id == photo.id)
         return photo.filename
 
     filename = gateway.catalog.run(remove)
+    until = f"; it can be restored for {days:g} days" if days else ""
     return DeletedPhotoResponse(
-        success=True, message=f"The photo {filename} is deleted.", deleted_file_id=file_id
+        success=True, message=f"The photo {filename} is deleted{until}.", deleted_file_id=file_id
     )
+
+
+@router.post("/uploads/{file_id}/restore", operation_id="restore_photo", dependencies=[WRITE])
+def restore_photo(
+    gateway: GatewayDep, admission: AdmissionDep, file_id: FileId, query: MapQuery
+) -> PhotoDetailResponse:
+    """Restore a deleted photo from the trash; it is described again if it has to be.
+
+    A photo that is not deleted stays as it is. 409 (`photo_exists`) if its bytes were uploaded
+    again meanwhile.
+    """
+    admission.admit_job(query.map)
+
+    def restore(session: Session) -> tuple[PhotoDetailResponse, JobMessage | None]:
+        map_ = lock_map(session, get_map(session, query.map).id)
+        photo = get_photo(session, map_.id, file_id, or_removed=True)
+        if photo.deleted_at is None:
+            return _photo_detail_response(session, photo, query.map), None
+        same = find_same_photo(session, map_.id, photo.sha256, photo.picture_sha256)
+        if same is not None:
+            raise Conflict(
+                "photo_exists",
+                f"The photo {photo.filename} was added again meanwhile.",
+                file_id=str(same.id),
+            )
+        photo.deleted_at = photo.purge_at = None
+        photo.changed_version = increment_map_version(session, map_.id)
+        # Compaction may have dropped its descriptor; one that is still there stays as it is.
+        job = _queue_again(session, photo)
+        message = JobMessage.of(job, query.map, photo.filename)
+        return _photo_detail_response(session, photo, query.map), message
+
+    response, message = gateway.catalog.run(restore)
+    if message is not None:
+        gateway.wakeups.send(message)
+    return response
 
 
 @router.get(
@@ -197,9 +252,12 @@ def _original_response(request: Request, gateway: GatewayContext, photo: Photo) 
     dependencies=[READ],
 )
 def read_thumbnail(gateway: GatewayDep, file_id: FileId, query: MapQuery) -> Response:
-    """Get a small JPEG without metadata; it exists once the photo has been described."""
+    """Get a small JPEG without metadata; it exists once the photo has been described.
+
+    Photos in the trash have it, too.
+    """
     with gateway.catalog.read() as session:
-        photo = get_photo(session, get_map(session, query.map).id, file_id)
+        photo = get_photo(session, get_map(session, query.map).id, file_id, or_removed=True)
     try:
         data = gateway.store.get(thumbnail_key(photo.id))
     except NotFound:
@@ -275,6 +333,12 @@ def _queue_preview(
             f"The photo has no preview, because it has not been described. {reason}",
         )
     admission.admit_job(map_name)
+    return _queue_again(session, photo)
+
+
+def _queue_again(session: Session, photo: Photo) -> Job:
+    """Queue the photo's job again; a photo that was described has a descriptor, which stays."""
+    job = session.get(Job, photo.job_id, with_for_update=True) if photo.job_id else None
     if job is None:  # deleted, or lost with the catalog
         job = Job(
             map_id=photo.map_id,
@@ -312,6 +376,7 @@ class MetadataSearchParams(FilterParams, PageParams):
     place_given: bool = Field(
         False, description="photos whose place was given with `POST /places`, and not undone"
     )
+    removed: bool = Field(False, description="photos in the trash, instead of those of the map")
     limit: int = Field(100, ge=1, le=1000)
 
     def metadata_filter(self) -> MetadataFilter:
@@ -329,6 +394,7 @@ class MetadataSearchParams(FilterParams, PageParams):
             failed=self.failed,
             without_place=self.without_place,
             place_given=self.place_given,
+            removed=self.removed,
         )
 
 

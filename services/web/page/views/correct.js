@@ -16,7 +16,7 @@ export async function keepAsTestPhoto(file, { latitude, longitude, place }) {
     return;
   }
   note("Kept as a test photo with this place: the map is measured with it.", "", async () => {
-    await ask(`/uploads/${stored.file_id}`, { method: "DELETE" });
+    await ask(`/uploads/${stored.file_id}`, { method: "DELETE", query: { permanently: true } });
     note("The test photo is removed again.");
   });
 }

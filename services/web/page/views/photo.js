@@ -1,13 +1,14 @@
 // One photo: large, where it is, its metadata, and changing them.
 
 import { ask, currentMap, get } from "../api.js";
-import { button, confirmed, field, fill, h, note, time } from "../dom.js";
+import { button, field, fill, h, note, time } from "../dom.js";
 import { bytes, degrees, nameOf, when } from "../format.js";
 import { openMap } from "../map.js";
 import { preview } from "../photo.js";
 import { coordinateTools } from "../places.js";
 import { givenInWords, undoPlaces } from "./places.js";
 import { readTags } from "./photos.js";
+import { remove } from "./trash.js";
 
 const LOOKALIKES = 5;
 
@@ -17,18 +18,15 @@ export async function showPhoto(view, { signal, id }) {
   document.title = `${nameOf(photo)} · ${currentMap()} · Placewise`;
   const ground = h("div", { class: "ground" });
   const form = editForm(photo);
-  const remove = async () => {
-    if (!(await confirmed("Delete this photo?", `${nameOf(photo)} disappears from all answers at once. This can’t be undone.`, "Delete"))) return;
-    await ask(`/uploads/${id}`, { method: "DELETE" });
-    note(`${nameOf(photo)} is deleted.`);
-    location.hash = "#/photos";
-  };
+  const removeIt = () => remove([photo], async () => {
+    location.hash = location.hash === "#/photos" ? `#/photo/${id}` : "#/photos";
+  });
   fill(view,
     h("header", { class: "head" },
       h("h1", { class: "file-name" }, nameOf(photo)),
       h("div", { class: "row" },
         h("a", { class: "button primary", href: `#/ask/${id}` }, "Find similar"),
-        button("Delete…", remove, "danger"))),
+        button("Remove", removeIt, "danger"))),
     h("div", { class: "one-photo" },
       h("figure", { class: "large-photo" }, preview(photo)),
       h("div", { class: "beside" },

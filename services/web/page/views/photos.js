@@ -1,11 +1,12 @@
 // Browse the map's photos: filter them, see where they are, tag and delete several at once.
 
 import { ask, get } from "../api.js";
-import { button, confirmed, field, fill, h, note, noteError, openDialog, time } from "../dom.js";
+import { button, field, fill, h, note, noteError, openDialog, time } from "../dom.js";
 import { count, nameOf, plural, whereabouts } from "../format.js";
 import { openMap } from "../map.js";
 import { thumbnail } from "../photo.js";
 import { unplacedCard } from "./places.js";
+import { remove } from "./trash.js";
 
 const PAGE = 48;
 const ON_THE_MAP = 1000; // the API's largest page
@@ -31,7 +32,7 @@ export async function showPhotos(view, { signal }) {
   });
   mapButton.setAttribute("aria-expanded", "false");
   fill(view,
-    h("header", { class: "head" }, h("h1", {}, "Photos"), h("div", { class: "row" }, mapButton, h("a", { class: "button primary", href: "#/add" }, "Add photos"))),
+    h("header", { class: "head" }, h("h1", {}, "Photos"), h("div", { class: "row" }, mapButton, h("a", { class: "button", href: "#/trash" }, "Trash"), h("a", { class: "button primary", href: "#/add" }, "Add photos"))),
     unplaced, form, ground, cut, total, tools, grid, more);
   unplacedCard(signal).then((card) => fill(unplaced, card), (error) => !signal.aborted && noteError(error));
 
@@ -85,7 +86,7 @@ export async function showPhotos(view, { signal }) {
     tools.hidden = chosen.size === 0;
     fill(tools, chosen.size > 0 && [
       h("strong", {}, plural(chosen.size, "photo") + " selected"),
-      button("Tag…", tagChosen), button("Delete…", deleteChosen, "danger"),
+      button("Tag…", tagChosen), button("Remove", removeChosen, "danger"),
       button("Clear selection", () => {
         for (const box of grid.querySelectorAll("input:checked")) box.checked = false;
         chosen.clear();
@@ -104,10 +105,7 @@ export async function showPhotos(view, { signal }) {
     await each((photo) => ask(`/uploads/${photo.image_id}`, { method: "PATCH", json: { tags: [...new Set([...photo.tags, ...added])] } }), "tagged");
   }
 
-  async function deleteChosen() {
-    if (!(await confirmed(`Delete ${plural(chosen.size, "photo")}?`, "They disappear from all answers at once. This can’t be undone.", "Delete"))) return;
-    await each((photo) => ask(`/uploads/${photo.image_id}`, { method: "DELETE" }), "deleted");
-  }
+  const removeChosen = () => remove([...chosen.values()], reload);
 
   async function each(change, done) {
     const photos = [...chosen.values()];
