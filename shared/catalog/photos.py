@@ -187,13 +187,9 @@ class PhotoFilterValues:
 
 def get_photo(session: Session, map_id: UUID, photo_id: UUID, *, or_removed: bool = False) -> Photo:
     """Return a live photo of the map, or also one in the trash; NotFound (`photo_not_found`)."""
-    is_there = Photo.deleted_at.is_(None)
+    is_there = is_kept() if or_removed else Photo.deleted_at.is_(None)
     photo = session.scalar(
-        sa.select(Photo).where(
-            Photo.id == photo_id,
-            Photo.map_id == map_id,
-            sa.or_(is_there, is_removed()) if or_removed else is_there,
-        )
+        sa.select(Photo).where(Photo.id == photo_id, Photo.map_id == map_id, is_there)
     )
     if photo is None:
         raise NotFound(
@@ -264,6 +260,11 @@ def is_geotagged(photo: type[Photo] = Photo) -> Condition:
 def is_removed() -> Condition:
     """Condition for deleted photos whose objects are kept for now: the trash."""
     return sa.and_(Photo.deleted_at.is_not(None), Photo.purge_at > db_now())
+
+
+def is_kept() -> Condition:
+    """Condition for live photos and those in the trash."""
+    return sa.or_(Photo.deleted_at.is_(None), is_removed())
 
 
 def mark_photo_deleted(
