@@ -56,6 +56,8 @@ class MetadataFilter:
     """Whether the photo's place must have been given here."""
     removed: bool = False
     """Whether the photo must be in the trash, instead of live."""
+    by_capture: bool = False
+    """Whether photos are sorted by when they were taken, and have to be dated."""
 
     def conditions(self, photo: type[Photo] = Photo, *, trigrams: bool) -> list[Condition]:
         """Return the SQL conditions; `trigrams` if the catalog has a trigram index (PostgreSQL)."""
@@ -124,7 +126,7 @@ def search_photos(
     """Search the live photos of a map, or those in its trash, newest first.
 
     Args:
-        after: Cursor: upload time and id of the last photo of the previous page.
+        after: Cursor: upload time (or capture time) and id of the last photo of the previous page.
 
     Returns:
         A page of photos, and the total number of matches, counted up to MAX_COUNTED_MATCHES.
@@ -134,11 +136,14 @@ def search_photos(
     live = [Photo.map_id == map_id, is_there]
     if metadata_filter.failed:
         live.append(Photo.id.in_(select_failed_photos(map_id)))
+    if metadata_filter.by_capture:
+        live.append(Photo.captured_at.is_not(None))
     conditions = [*live, *metadata_filter.conditions(trigrams=on_postgres)]
     total = count_rows(session, select(Photo.id).where(*conditions), MAX_COUNTED_MATCHES)
-    newest = (Photo.uploaded_at.desc(), Photo.id.desc())
+    time = Photo.captured_at if metadata_filter.by_capture else Photo.uploaded_at
+    newest = (time.desc(), Photo.id.desc())
     if after is not None:
-        live.append(tuple_(Photo.uploaded_at, Photo.id) < tuple_(*_cursor_bound(after)))
+        live.append(tuple_(time, Photo.id) < tuple_(*_cursor_bound(after)))
     page: Select[Photo]
     if total < MAX_COUNTED_MATCHES:
         rare = select(Photo.id).where(*conditions).cte("rare")
@@ -150,7 +155,7 @@ def search_photos(
         newest_first = select(Photo).where(*live).order_by(*newest).offset(0).subquery()
         scanned = aliased(Photo, newest_first)
         page = select(scanned).where(*metadata_filter.conditions(scanned, trigrams=False))
-        page = page.order_by(scanned.uploaded_at.desc(), scanned.id.desc())
+        page = page.order_by(getattr(scanned, time.key).desc(), scanned.id.desc())
     return list(session.scalars(page.limit(limit))), total
 
 

@@ -392,6 +392,27 @@ def test_a_match_is_shown_beside_the_photo_with_lines_between_their_points(
     expect(dialog).to_have_count(0)
 
 
+def test_no_lines_cover_the_photos_on_a_phone(visitor: Visitor, city: CityServer) -> None:
+    visitor.page.set_viewport_size({"width": 390, "height": 844})
+    page = ask(visitor, city.queries[0])
+    page.locator(".match").first.click()
+    dialog = page.get_by_role("dialog")
+    expect(dialog.get_by_label("Lines")).to_have_value("0")
+    expect(dialog.locator(".lines line")).to_have_count(0)
+
+
+def test_the_answer_names_the_folder_and_the_day_of_the_best_match(
+    visitor: Visitor, city: CityServer
+) -> None:
+    found = city.ask(city.queries[0])
+    found["estimate"] |= {"in_map": True}
+    best = max(found["similar_images"], key=lambda photo: photo["match_probability"] or 0)
+    best |= {"relative_path": "Sommer 2025/a.jpg", "captured_at": "2025-06-18T23:30:00Z"}
+    best["match_probability"] = 1.0
+    page = ask(visitor, city.queries[0], found)
+    expect(page.locator(".looks-like")).to_have_text("Looks like Sommer 2025, 18 June 2025")
+
+
 def test_a_photo_of_the_map_finds_its_neighbours_and_not_itself(
     visitor: Visitor, city: CityServer
 ) -> None:

@@ -55,6 +55,30 @@ def test_photos_are_filtered_by_name_tag_and_place(visitor: Visitor, city: CityS
     expect(page.get_by_role("heading", name="No photo matches the filter")).to_be_visible()
 
 
+def test_photos_are_sorted_by_when_they_were_taken_below_the_names_of_their_folders(
+    visitor: Visitor, city: CityServer
+) -> None:
+    ids = bring_in(city, "sorted-1.jpg", "sorted-2.jpg", "sorted-3.jpg")
+    for number, photo_id in enumerate(ids[:2]):
+        changed = {
+            "captured_at": f"2025-06-{18 - number}T12:00:00Z",
+            "relative_path": "Day 1/x.jpg",
+        }
+        city.server.client.patch(
+            f"/api/v1/uploads/{photo_id}", params={"map": MAP}, json=changed
+        ).raise_for_status()
+    page = visitor.visit("photos")
+    expect(page.get_by_role("heading", name="Day 1")).to_be_visible()
+    page.get_by_role("button", name="Only this folder").first.click()
+    expect(page.locator(".photo-card")).to_have_count(2)
+    page.get_by_label("Order").select_option("taken")
+    expect(page.locator(".photo-card").first).to_contain_text("18 June 2025")
+    expect(page.locator(".photo-card").last).to_contain_text("17 June 2025")
+    for photo_id in ids:
+        params = {"map": MAP, "permanently": True}
+        city.server.client.delete(f"/api/v1/uploads/{photo_id}", params=params)
+
+
 def test_the_map_shows_where_photos_are_and_takes_a_point(visitor: Visitor) -> None:
     page = visitor.visit("photos")
     # While the map is being loaded, the photos are requested again.

@@ -7,7 +7,8 @@ import binascii
 import time
 from collections.abc import Iterator
 from datetime import datetime
-from typing import Annotated, Any, BinaryIO
+from functools import partial
+from typing import Annotated, Any, BinaryIO, Literal
 from urllib.parse import quote
 from uuid import UUID
 
@@ -377,6 +378,9 @@ class MetadataSearchParams(FilterParams, PageParams):
         False, description="photos whose place was given with `POST /places`, and not undone"
     )
     removed: bool = Field(False, description="photos in the trash, instead of those of the map")
+    sort: Literal["added", "taken"] = Field(
+        "added", description="newest first; `taken`: only photos whose time is known"
+    )
     limit: int = Field(100, ge=1, le=1000)
 
     def metadata_filter(self) -> MetadataFilter:
@@ -395,6 +399,7 @@ class MetadataSearchParams(FilterParams, PageParams):
             without_place=self.without_place,
             place_given=self.place_given,
             removed=self.removed,
+            by_capture=self.sort == "taken",
         )
 
 
@@ -402,14 +407,14 @@ class MetadataSearchParams(FilterParams, PageParams):
 def search_photos_by_metadata(
     gateway: GatewayDep, query: Annotated[MetadataSearchParams, Query()]
 ) -> MetadataSearchResponse:
-    """Search photos by their metadata, newest first, with a cursor."""
+    """Search photos by their metadata, newest first, with a cursor (of the same `sort`)."""
     started = time.perf_counter()
     metadata_filter = query.metadata_filter()
     after = _decode_cursor(query.cursor) if query.cursor else None
     with gateway.catalog.read() as session:
         map_id = get_map(session, query.map).id
         matches, total = search_photos(session, map_id, metadata_filter, query.limit + 1, after)
-    page, next_cursor = query.split(matches, _encode_cursor)
+    page, next_cursor = query.split(matches, partial(_encode_cursor, metadata_filter))
     return MetadataSearchResponse(
         total_found=total,
         total_is_exact=total < MAX_COUNTED_MATCHES,
@@ -431,8 +436,10 @@ def _read_blocks(file: BinaryIO) -> Iterator[bytes]:
             yield block
 
 
-def _encode_cursor(last: Photo) -> str:
-    return base64.urlsafe_b64encode(f"{last.uploaded_at.isoformat()} {last.id}".encode()).decode()
+def _encode_cursor(metadata_filter: MetadataFilter, last: Photo) -> str:
+    time = last.captured_at if metadata_filter.by_capture else last.uploaded_at
+    assert time is not None
+    return base64.urlsafe_b64encode(f"{time.isoformat()} {last.id}".encode()).decode()
 
 
 def _decode_cursor(cursor: str) -> tuple[datetime, UUID]:

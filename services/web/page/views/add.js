@@ -5,7 +5,7 @@ import { fileChooser, takesDrops, takesPastes } from "../drop.js";
 import { bytes, count, plural } from "../format.js";
 import { serverSettings } from "../settings.js";
 import { localPicture } from "../photo.js";
-import { UploadQueue } from "../uploads.js";
+import { UploadQueue, addedInWords } from "../uploads.js";
 import { unplacedCard } from "./places.js";
 import { readTags } from "./photos.js";
 
@@ -92,13 +92,13 @@ function detailsForm() {
 }
 
 function drawSummary(summary) {
-  const { total, done, failed, sending } = queue.figures();
+  const { total, done, failed, already, sending } = queue.figures();
   if (!total) {
     fill(summary);
     return;
   }
   const open = total - done - failed;
-  const words = open ? `${count(done)} of ${plural(total, "photo")} searchable` : failed ? `${count(done)} of ${plural(total, "photo")} added` : `${plural(total, "photo")} added`;
+  const words = open ? `${count(done)} of ${plural(total, "photo")} searchable` : failed ? `${addedInWords({ done, already })}, of ${count(total)}` : addedInWords({ done, already });
   fill(summary,
     h("div", { class: "summary-words" },
       h("h2", { role: "status" }, words),
