@@ -75,7 +75,7 @@ def test_photos_are_sorted_by_when_they_were_taken_below_the_names_of_their_fold
     expect(page.locator(".photo-card").first).to_contain_text("18 June 2025")
     expect(page.locator(".photo-card").last).to_contain_text("17 June 2025")
     for photo_id in ids:
-        params = {"map": MAP, "permanently": True}
+        params = {"map": MAP, "permanently": "true"}
         city.server.client.delete(f"/api/v1/uploads/{photo_id}", params=params)
 
 
@@ -99,7 +99,7 @@ def test_chosen_photos_are_tagged_removed_and_restored(visitor: Visitor, city: C
     page = visitor.visit("photos")
     page.get_by_label("Name").fill("tagged-")
     expect(page.locator(".photo-card")).to_have_count(2)
-    for box in page.get_by_role("checkbox").all():
+    for box in page.locator(".photo-card").get_by_role("checkbox").all():
         box.check()
     page.get_by_role("button", name="Tag…").click()
     page.get_by_label("Tags to add").fill("second, third")
@@ -107,7 +107,7 @@ def test_chosen_photos_are_tagged_removed_and_restored(visitor: Visitor, city: C
     expect(page.locator(".photo-card .chips").first).to_contain_text("third")
     assert city.get(f"/uploads/{ids[0]}")["tags"] == ["first", "second", "third"]
 
-    page.get_by_role("checkbox").first.check()
+    page.locator(".photo-card").get_by_role("checkbox").first.check()
     page.get_by_role("button", name="Remove").click()
     expect(page.locator(".photo-card")).to_have_count(1)
     assert city.get("/search", filename="tagged-")["total_found"] == 1

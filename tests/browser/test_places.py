@@ -33,7 +33,7 @@ def unplaced(city: CityServer, tmp_path: Path) -> Iterator[list[str]]:
         ids.append(answer.json()["file_id"])
     yield ids
     for file_id in ids:
-        params = {"map": MAP, "permanently": True}
+        params = {"map": MAP, "permanently": "true"}
         city.server.client.delete(f"/api/v1/uploads/{file_id}", params=params)
 
 
