@@ -7,7 +7,7 @@ A place is given only where a photo has none. What was there before is kept in t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import UTC, datetime, timedelta
+from datetime import MAXYEAR, UTC, datetime, timedelta
 from typing import Annotated, Any, Self
 from uuid import UUID
 
@@ -42,6 +42,7 @@ from shared.geotagging.locate import (
     picture_evidence,
     probable_label,
 )
+from shared.imaging.capture_place import is_null_island
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS
 from shared.responses.reconstructions import (
     GivenPlacesResponse,
@@ -76,8 +77,11 @@ class GivenPlaceBody(FiniteModel):
     def _check(self) -> Self:
         if (self.latitude is None) != (self.longitude is None):
             raise ValueError("send both `latitude` and `longitude`, or neither")
-        if self.latitude is None and not (self.place or "").strip():
+        self.place = (self.place or "").strip() or None
+        if self.latitude is None and self.place is None:
             raise ValueError("send coordinates or a `place`")
+        if self.latitude is not None and is_null_island(self.latitude, self.longitude or 0.0):
+            raise ValueError("0, 0 are the coordinates of no place")
         return self
 
     def columns(self, photo: Photo) -> dict[str, Any]:
@@ -88,7 +92,7 @@ class GivenPlaceBody(FiniteModel):
         if self.heading is not None and photo.heading is None:
             columns["heading"] = self.heading % 360
         if self.place:
-            columns["place"] = self.place.strip()
+            columns["place"] = self.place
         return columns
 
 
@@ -100,7 +104,9 @@ def read_dated_photos(
     A place that was given by a proposal is none: it would count twice what that rested on.
     """
     hours = timedelta(hours=CLOCK_HOURS)
-    times = [photo.captured_at for photo in photos if photo.captured_at is not None]
+    ids = [photo.id for photo in photos]
+    # Clocks that were never set show the year 1, from which nothing can be subtracted.
+    times = [p.captured_at for p in photos if p.captured_at and 1 < p.captured_at.year < MAXYEAR]
     same_hours = [Photo.captured_at.between(time - hours, time + hours) for time in times]
     rows = session.execute(
         select(
@@ -115,9 +121,11 @@ def read_dated_photos(
         .where(
             Photo.map_id == map_id,
             Photo.deleted_at.is_(None),
-            or_(Photo.id.in_([photo.id for photo in photos]), *same_hours),
+            or_(Photo.id.in_(ids), *same_hours),
         )
-        .order_by(Photo.given_place.is_not(None), Photo.latitude.is_(None), Photo.id)
+        .order_by(
+            Photo.id.not_in(ids), Photo.given_place.is_not(None), Photo.latitude.is_(None), Photo.id
+        )
         .limit(MAX_NEIGHBOURS)
     ).all()
     dated = add_time_zones([_dated_photo(*row[1:]) for row in rows])
@@ -191,7 +199,6 @@ def propose_places(
     return [
         _propose_place(gateway, map_name, photo, dated[photo.id], finder, photo_count)
         for photo in photos
-        if photo.id in dated
     ]
 
 

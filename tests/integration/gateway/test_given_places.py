@@ -165,8 +165,21 @@ def test_an_accepted_proposal_is_no_evidence_for_the_next_one(service: Service) 
     assert "taken 20 s after trip/1.jpg" in proposal["reason"]
 
 
+def test_a_clock_that_was_never_set_locates_nothing(service: Service) -> None:
+    for number, time in enumerate(("0001-01-01T00:00:00Z", "9999-12-31T23:00:00Z")):
+        stored(service, number, captured_at=time)
+    assert len(propose(service)["proposals"]) == 2
+
+
 def test_incomplete_places_are_refused(service: Service) -> None:
     photo = stored(service, 1)
-    for place in ({}, {"latitude": 45.0}, {"place": "  "}, {"latitude": 95, "longitude": 7}):
+    nowhere = {"latitude": 0, "longitude": 0}
+    for place in (
+        {},
+        {"latitude": 45.0},
+        {"place": "  "},
+        {"latitude": 95, "longitude": 7},
+        nowhere,
+    ):
         body = {"photos": [{"file_id": photo, **place}]}
         assert problem(service("POST", "/places", json=body), 422, "invalid_field")
