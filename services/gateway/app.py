@@ -33,6 +33,7 @@ from services.gateway.routes import (
     model_changes,
     models,
     photos,
+    places,
     positions,
     presigned_uploads,
     reconstructions,
@@ -78,6 +79,7 @@ RESOURCES = (
     similarity,
     tracks,
     photos,
+    places,
     positions,
     model_changes,
     models,
@@ -113,6 +115,7 @@ def create_app(gateway: GatewayContext) -> FastAPI:
         form_paths=form_paths(),
         exempt_paths={f"{API_PREFIX}{batches.BATCH_UPLOAD_PATH}"},
         limits={
+            f"{API_PREFIX}{places.PROPOSALS_PATH}": positions.MAX_BODY_BYTES,
             f"{API_PREFIX}{positions.POSITIONS_PATH}": positions.MAX_BODY_BYTES,
             f"{API_PREFIX}{reconstructions.IMPORT_PATH}": reconstructions.MAX_MODEL_BYTES,
             f"{API_PREFIX}{similarity.GEOPOSE_PATH}": MAX_GEOPOSE_BYTES,

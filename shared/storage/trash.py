@@ -1,7 +1,7 @@
 """The trash of an object store, and the hold that suspends garbage collection.
 
-Orphans are moved to the trash and deleted after TRASH_DAYS. Objects that a user deletes are not
-moved there: they are deleted immediately, so that their space is free.
+Orphans are moved to the trash and deleted after TRASH_DAYS. Objects of photos that a
+user deletes are not moved there: they stay where they are until `Photo.purge_at`.
 
 The hold is a note in the store that gives the reason why orphans are not collected until an
 operator decides. The steward writes it, GET /health tells it, and `placewise storage

@@ -54,7 +54,7 @@ def test_photos_are_described_found_and_deleted_in_the_bucket(
     thumbnail = f"thumbnails/{photos[2]}.jpg"
     assert thumbnail in keys(bucket, "thumbnails/")
     before = keys(bucket, "originals/")
-    assert server.client.delete(f"/api/v1/uploads/{photos[2]}").status_code == 200
+    assert server.client.delete(f"/api/v1/uploads/{photos[2]}?permanently=true").is_success
     wait_until(lambda: len(keys(bucket, "originals/")) < 3, GONE_SECONDS)
     wait_until(lambda: thumbnail not in keys(bucket, "thumbnails/"), GONE_SECONDS)
     assert keys(bucket, "originals/") < before

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from dataclasses import asdict
 from datetime import timedelta
 from typing import Annotated, Any, Literal, Self
 
@@ -53,11 +54,13 @@ Name = Annotated[str, Field(max_length=MAX_NAME)]
 ClockOffset = Annotated[timedelta, Field(ge=timedelta(days=-1), le=timedelta(days=1))]
 
 
-class _Finite(RequestModel):
+class FiniteModel(RequestModel):
+    """A body whose numbers are finite."""
+
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
-class SimilarBody(_Finite):
+class SimilarBody(FiniteModel):
     """A photo of the map that looks similar."""
 
     name: Name
@@ -66,7 +69,7 @@ class SimilarBody(_Finite):
     score: float = Field(ge=-10, le=10)
 
 
-class CircleBody(_Finite):
+class CircleBody(FiniteModel):
     """A level of the estimate."""
 
     latitude: Latitude
@@ -75,7 +78,7 @@ class CircleBody(_Finite):
     probability: Probability
 
 
-class PoseBody(_Finite):
+class PoseBody(FiniteModel):
     """The pose that a search found, if it has coordinates."""
 
     latitude: Latitude
@@ -84,7 +87,7 @@ class PoseBody(_Finite):
     heading: float = Field(ge=0, le=360)
 
 
-class SearchBody(_Finite):
+class SearchBody(FiniteModel):
     """What a similarity search answered for the photo."""
 
     similar: list[SimilarBody] = Field(max_length=MAX_SIMILAR, description="best first")
@@ -94,7 +97,7 @@ class SearchBody(_Finite):
     headline: str = Field("", max_length=MAX_NAME, description="of the estimate")
 
 
-class DatedPhotoBody(_Finite):
+class DatedPhotoBody(FiniteModel):
     """A photo of a folder, with or without coordinates."""
 
     name: Name
@@ -118,13 +121,13 @@ class DatedPhotoBody(_Finite):
         return coordinate_pair(self.latitude, self.longitude)
 
 
-class TrackPointBody(_Finite):
+class TrackPointBody(FiniteModel):
     time: AwareDatetime
     latitude: Latitude
     longitude: Longitude
 
 
-class ProposalOptions(_Finite):
+class ProposalOptions(FiniteModel):
     """What is known beside the photos."""
 
     track: FailFastList[TrackPointBody] = Field(
@@ -227,16 +230,9 @@ def proposal_fields(
     name: str, proposal: Proposal | None, reason: str, radius_m: float
 ) -> dict[str, Any]:
     """Return the fields of a `ProposalResponse`."""
-    return {
-        "name": name,
-        "latitude": proposal.latitude if proposal else None,
-        "longitude": proposal.longitude if proposal else None,
-        "radius_m": radius_m,
-        "probability": proposal.probability if proposal else 0.0,
-        "radius_68_m": proposal.radius_68_m if proposal else None,
-        "heading": proposal.heading if proposal else None,
-        "reason": reason,
-    }
+    if proposal is None:
+        return {"name": name, "radius_m": radius_m, "probability": 0.0, "reason": reason}
+    return {"name": name, **asdict(proposal)}
 
 
 def _picture_evidence(search: SearchBody | None, photo_count: int) -> PictureEvidence | None:

@@ -28,7 +28,7 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.installation import check_not_behind
 from shared.catalog.jobs import UNFINISHED_STATES, UPLOAD_JOBS, Job, JobKind, JobState
 from shared.catalog.models import Model
-from shared.catalog.photos import Photo, PresignedUpload
+from shared.catalog.photos import Photo, PresignedUpload, is_kept
 from shared.catalog.reconstructions import Reconstruction
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.errors import Conflict
@@ -231,10 +231,8 @@ def _referenced_incoming(session: Session, keys: list[str]) -> Iterable[str]:
 
 def _referenced_derived_images(session: Session, keys: list[str]) -> Iterable[str]:
     photo_ids = _parse_uuids(key.rpartition("/")[2].removesuffix(".jpg") for key in keys)
-    live = session.scalars(
-        select(Photo.id).where(Photo.id.in_(photo_ids), Photo.deleted_at.is_(None))
-    )
-    return [key for photo_id in live for key in derived_image_keys(photo_id)]
+    kept = session.scalars(select(Photo.id).where(Photo.id.in_(photo_ids), is_kept()))
+    return [key for photo_id in kept for key in derived_image_keys(photo_id)]
 
 
 def _referenced_chunks(session: Session, keys: list[str]) -> Iterable[str]:

@@ -120,6 +120,8 @@ def test_every_url_in_an_answer_leads_to_its_map(service: Service) -> None:
     call("get_photo", "GET", f"/uploads/{file_id}")
     call("patch_photo", "PATCH", f"/uploads/{file_id}", json={"tags": ["a"]})
     call("search_metadata", "GET", "/search")
+    call("patch_photo", "PATCH", f"/uploads/{file_id}", json={"place": None})
+    call("propose_places", "POST", "/places/proposals", json={})
 
     call("similar_to_stored", "POST", f"/similarity/{file_id}")
     query = {"file": ("query.jpg", photo_bytes(5))}
