@@ -33,6 +33,7 @@ from services.search.worker import SearchWorker
 from services.service_process import start_service_threads, stop_when_a_thread_crashes
 from services.steward.batches.worker import BatchWorker
 from services.steward.evaluation_worker import EvaluationWorker
+from services.steward.library_sync import LibrarySyncWorker
 from services.steward.metrics import StewardMetrics
 from services.steward.scheduler import Scheduler
 from services.steward.tasks.maintenance import reclaim_leases
@@ -168,6 +169,7 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         steward_metrics = StewardMetrics(registry)
         steward = Scheduler(catalog, store, wakeups, settings, steward_metrics)
         evaluator = EvaluationWorker(catalog, search, settings, name, steward_metrics)
+        libraries = LibrarySyncWorker(catalog, settings, name, steward_metrics)
         webhooks = WebhookDispatcher(catalog, settings)
         batches = BatchWorker(catalog, store, wakeups, settings, name, steward_metrics)
         metered_search = MeteredSearch(search, registry)
@@ -220,6 +222,7 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
                 "extractor": run_extractor,
                 "steward": steward.run,
                 "evaluator": evaluator.run,
+                "libraries": libraries.run,
                 "batches": batches.run,
                 "webhooks": webhooks.run,
             },

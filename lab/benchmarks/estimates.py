@@ -40,7 +40,7 @@ from lab.evaluation.query_clusters import cluster_queries
 from services.cli.environment import read_settings
 from services.cli.output import JsonOption, Table
 from shared.errors import InvalidRequest, Misconfigured
-from shared.evaluation.bootstrap import bootstrap_intervals
+from shared.evaluation.bootstrap import share_intervals
 from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.evidence import (
     EVIDENCE_DEPTH,
@@ -334,10 +334,7 @@ class TrialMap:
         """Return the sample of a photo of the set."""
         truth = self.photos.locations[query]
         levels = candidate_levels(
-            *self.search(query),
-            self.photos.scheme,
-            spread,
-            self.photos.radius_m,
+            *self.search(query), self.photos.scheme, spread, self.photos.radius_m
         )
         return PlaceSample(query, levels, [level.is_right(truth) for level in levels])
 
@@ -447,13 +444,13 @@ def _add_shares(report: Report, what: str, *shares: Share) -> None:
     """Report shares in %, 100 % of no estimates, and show them with their intervals."""
     table = Table("share", "%", "95 % interval", title=what)
     for share in shares:
-        values = np.array([100.0 * share.counts(j) for j in share.judged])[:, None]
-        mean = float(values.mean()) if len(values) else 100.0
+        values = np.array([float(share.counts(j)) for j in share.judged])[:, None]
+        mean = 100 * float(values.mean()) if len(values) else 100.0
         report.add(
             f"{what}: {share.name}", mean, "%", at_most=share.at_most, at_least=share.at_least
         )
         clusters = np.array([j.cluster for j in share.judged], dtype=np.int64)
-        intervals = bootstrap_intervals(values, clusters)
-        bounds = f"{intervals[0].low:.1f} to {intervals[0].high:.1f}" if intervals else ""
+        intervals = share_intervals(values, clusters)
+        bounds = intervals[0].as_percent() if intervals else ""
         table.add_row(share.name, f"{mean:.1f}", bounds)
     report.tables.append(table)

@@ -52,8 +52,7 @@ class ServiceSettings(BaseSettings):
     port: int = Field(8000, ge=0, le=65535, description="listening port; 0 picks a free port")
     debug: bool = Field(
         False,
-        description="log every request and every rejected request, and restart the embedded server "
-        "of a checkout when its code changes; responses stay the same",
+        description="log every request and every rejected request; responses stay the same",
     )
     log_format: Literal["text", "json"] = Field(
         "text", description="log format; json writes one JSON object per line"

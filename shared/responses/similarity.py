@@ -32,6 +32,16 @@ class SeenPoint(ResponseModel):
     """in the component's frame"""
 
 
+class GivenPlace(ResponseModel):
+    """What a place rests on that was given to a photo with `POST /places`."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    probability: float | None = Field(description="of the proposal; null if a person chose it")
+    reason: str
+    given_at: datetime
+
+
 class PhotoResponse(ResponseModel):
     """A stored photo."""
 
@@ -56,6 +66,9 @@ class PhotoResponse(ResponseModel):
     )
     captured_at: datetime | None
     place: str | None
+    given_place: GivenPlace | None = Field(
+        None, description="if the place was given here: what it rests on, until it is undone"
+    )
     role: Annotated[PhotoRole, OPEN]
     image_url: str
     thumbnail_url: str

@@ -33,7 +33,7 @@ from tests.support.poses import ORIGIN, SIMILARITY
 from tests.support.problems import problem
 from tests.support.reconstructed_scene import ReconstructedScene
 
-pytestmark = [pytest.mark.databases("sqlite"), pytest.mark.numerics]
+pytestmark = pytest.mark.numerics
 
 PHOTOS = 8
 

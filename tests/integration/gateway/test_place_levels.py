@@ -14,8 +14,6 @@ from tests.integration.in_process_api import Service
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 
-pytestmark = pytest.mark.databases("sqlite")
-
 PATHS = ("tower/7/lift", "tower/7/hall", "tower/8/lift", "tower//attic", "tower", "a")
 
 

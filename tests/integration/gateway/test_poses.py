@@ -54,7 +54,6 @@ from tests.support.poses import (
 from tests.support.problems import problem
 from tests.support.reconstructed_scene import CAMERA, ReconstructedScene
 
-pytestmark = pytest.mark.databases("sqlite")
 NOT_ALIGNED = "2 of its photos have coordinates, and 3 are needed."
 
 

@@ -35,6 +35,8 @@ from shared.storage.chunks import decode_rows, encode_rows
 from tests.support.search_tier import SearchServer, SearchTier
 from tests.support.small_map import SmallMap, assert_answers, unit_rows
 
+pytestmark = pytest.mark.databases("postgresql")
+
 SLOTS = 7  # three shards have three, two and two of them
 BACK_SECONDS = 20.0  # for a worker that was started again to be seen: about one, in truth
 VECTOR = unit_rows(1000, 1)[0]

@@ -38,6 +38,8 @@ from tests.support.catalog_rows import (
     upload,
 )
 
+pytestmark = pytest.mark.databases("postgresql")
+
 
 @pytest.mark.databases("sqlite", "postgresql")
 def test_concurrent_garbage_collections_are_safe(chunk_map: ChunkMap) -> None:

@@ -22,7 +22,7 @@ from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 from typer.testing import CliRunner, Result
 
-from services.cli.locate import command, preview, undo_journal, writers
+from services.cli.locate import preview, undo_journal, writers
 from services.cli.locate.folder import read_folder, read_gpx
 from services.cli.locate.sidecars import add_position
 from services.cli.main import build_app
@@ -572,12 +572,14 @@ def test_a_photo_that_got_coordinates_or_was_moved_during_the_searches_is_left_a
     located, moved, changed = (folder / name for name in ("day 1/2.jpg", "5.jpg", "6.jpg"))
     changed.write_bytes(photo(30))
 
+    write_locations = writers.write_locations
+
     def write_later(*arguments: Any) -> Any:
         located.write_bytes(photo(20, 5.0))
         moved.unlink()
-        return writers.write_locations(*arguments)
+        return write_locations(*arguments)
 
-    monkeypatch.setattr(command, "write_locations", write_later)
+    monkeypatch.setattr(writers, "write_locations", write_later)
     result = run(folder, "--write", target)
     assert result.exit_code == 1
     assert "day 1/2.jpg: got coordinates meanwhile" in result.stderr
