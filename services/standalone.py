@@ -1,4 +1,4 @@
-"""The embedded server: gateway, extractor, search and steward in one process.
+"""The embedded server: gateway, search and steward in one process, the extractor in another.
 
 It needs no other servers: it uses SQLite and a local folder, or a bucket if S3_ENDPOINT is set. It
 runs the same classes as the separate services with other adapters, which the first table of
@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import uvicorn
 from prometheus_client import CollectorRegistry
 
+from services.embedded_extractor import ExtractorProcess, extractor_lock
 from services.gateway.app import create_app
 from services.gateway.authentication import (
     ApiKeyAuthenticator,
@@ -44,7 +45,7 @@ from shared.catalog.generations import RowType
 from shared.catalog.installation import check_before_new_catalog, open_installation_store
 from shared.catalog.jobs import EXTRACTOR_JOBS
 from shared.catalog.maps import get_or_create_default_map
-from shared.catalog.processes import delete_dead_search_workers, delete_processes, process_heartbeat
+from shared.catalog.processes import delete_dead_search_workers, delete_processes
 from shared.catalog.tables import open_catalog
 from shared.config.disk_space import DiskReserve
 from shared.config.embedded_home import announce_server, lock_home
@@ -110,8 +111,8 @@ def serve_standalone(settings: Settings, on_ready: Callable[[Standalone], None])
 def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Iterator[Standalone]:
     """Context manager that starts all services and stops them at the end.
 
-    The extractor is loaded in its own thread, because importing torch takes seconds: at once, or
-    with `lazy_extractor` when the first of its jobs is queued.
+    The extractor's process is started at once, or with `lazy_extractor` when the first of its jobs
+    is queued.
 
     Locks PLACEWISE_HOME first. If the catalog is in that folder, the leases and registrations of a
     killed process are deleted; with DATABASE_URL they may be those of running services, and expire.
@@ -130,9 +131,11 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
             "SEARCH_URLS is set, but the embedded server searches in its own process. Unset "
             "SEARCH_URLS, or run placewise gateway, extractor and steward.",
         )
-    home = settings.placewise_home
+    home, name = settings.placewise_home, f"embedded-{os.getpid()}"
     with contextlib.ExitStack() as stack:
         stack.enter_context(lock_home(home))
+        with extractor_lock(home):
+            pass  # the extractor of a server that was killed has ended
         listener = stack.enter_context(listen(settings.host, settings.port))
         catalog = open_catalog(settings, "embedded")
         stack.callback(catalog.close)
@@ -141,7 +144,9 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         check_before_new_catalog(catalog, settings)
         migrate(catalog)
         store = open_installation_store(catalog, settings, exclusive=True)
-        wakeups = InProcessWakeups()
+        extractor = ExtractorProcess(catalog, settings, name)
+        wakeups = InProcessWakeups(extractor.look)
+        catalog.commits.announce = extractor.look
         with catalog.write() as session:
             get_or_create_default_map(
                 session, settings.new_map_extractor, RowType(settings.descriptor_rows)
@@ -154,6 +159,7 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
             reclaim_leases(catalog, wakeups, all_leases=True)
 
         registry = CollectorRegistry()  # shared: /metrics has the metrics of all services
+        registry.register(extractor)
         stack.enter_context(serve_metrics(settings, registry))
         # After everything that can fail: a key that is created but not shown would be lost.
         host, port = listener.getsockname()[:2]
@@ -163,7 +169,6 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         stack.enter_context(announce_server(home, url, local_key))
 
         search = SearchWorker(catalog, store, settings)
-        name = f"embedded-{os.getpid()}"
         heartbeat = WorkerHeartbeat(catalog, search, name)
         steward_metrics = StewardMetrics(registry)
         steward = Scheduler(catalog, store, wakeups, settings, steward_metrics)
@@ -191,24 +196,10 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
                 _wait_for_extractor_jobs(catalog, settings, wakeups, stop)
             if stop.is_set():
                 return
-            from services.extractor.worker import ExtractorWorker
-
             try:
-                extractor = ExtractorWorker(
-                    catalog, store, settings, name, only_worker=True, registry=registry
-                )
+                extractor.run(stop)
             except PlacewiseError as error:
                 running.stop(error)
-                return
-            with (
-                contextlib.closing(extractor),
-                process_heartbeat(catalog, "extractor", extractor.state),
-            ):
-                threads = start_service_threads({"fits": extractor.fits.run}, stop)
-                extractor.warm_up(stop)
-                extractor.run(stop, wakeups.wait)
-                for thread in threads:
-                    thread.join()
 
         stop = threading.Event()
         stack.enter_context(stop_when_a_thread_crashes(running.stop))
@@ -230,6 +221,7 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         finally:
             stop.set()
             wakeups.send()
+            extractor.end()
             for thread in threads:
                 thread.join()
 
