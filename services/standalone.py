@@ -43,7 +43,6 @@ from shared.catalog.database.schema import migrate, sqlite_file
 from shared.catalog.database.session import REQUEST_TIMEOUTS, Catalog
 from shared.catalog.generations import RowType
 from shared.catalog.installation import check_before_new_catalog, open_installation_store
-from shared.catalog.jobs import EXTRACTOR_JOBS
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.processes import delete_dead_search_workers, delete_processes
 from shared.catalog.tables import open_catalog
@@ -52,7 +51,6 @@ from shared.config.embedded_home import announce_server, lock_home
 from shared.config.settings import Settings
 from shared.errors import Misconfigured, PlacewiseError
 from shared.jobs import InProcessWakeups
-from shared.jobs.runner import IDLE_POLL_SECONDS, JobRunner
 from shared.security.api_keys import Scope, generate_local_key, hash_api_key, is_loopback
 from shared.telemetry.logs import configure_logging
 from shared.telemetry.metrics_server import serve_metrics
@@ -133,6 +131,8 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         )
     home, name = settings.placewise_home, f"embedded-{os.getpid()}"
     with contextlib.ExitStack() as stack:
+        extractor = ExtractorProcess(settings, name, lazy=lazy_extractor)
+        stack.callback(extractor.end)
         stack.enter_context(lock_home(home))
         with extractor_lock(home):
             pass  # the extractor of a server that was killed has ended
@@ -144,9 +144,7 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         check_before_new_catalog(catalog, settings)
         migrate(catalog)
         store = open_installation_store(catalog, settings, exclusive=True)
-        extractor = ExtractorProcess(catalog, settings, name)
         wakeups = InProcessWakeups(extractor.look)
-        catalog.commits.announce = extractor.look
         with catalog.write() as session:
             get_or_create_default_map(
                 session, settings.new_map_extractor, RowType(settings.descriptor_rows)
@@ -191,24 +189,22 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         )
         running = Standalone(url, gateway.lan_url, server, listener, first_admin_key, local_key)
 
-        def run_extractor(stop: threading.Event) -> None:
-            if lazy_extractor:
-                _wait_for_extractor_jobs(catalog, settings, wakeups, stop)
-            if stop.is_set():
-                return
+        def run_extractor(_stop: threading.Event) -> None:
             try:
-                extractor.run(stop)
+                extractor.run(catalog)
             except PlacewiseError as error:
                 running.stop(error)
 
         stop = threading.Event()
         stack.enter_context(stop_when_a_thread_crashes(running.stop))
+        catalog.commits.announce = extractor.look
+        extractor.look()
         threads = start_service_threads(
             {
                 "search": search.run,
                 "search of building generations": search.run_building,
                 "search heartbeat": heartbeat.run,
-                "extractor": run_extractor,
+                "extractor process": run_extractor,
                 "steward": steward.run,
                 "evaluator": evaluator.run,
                 "batches": batches.run,
@@ -224,14 +220,6 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
             extractor.end()
             for thread in threads:
                 thread.join()
-
-
-def _wait_for_extractor_jobs(
-    catalog: Catalog, settings: Settings, wakeups: InProcessWakeups, stop: threading.Event
-) -> None:
-    runner = JobRunner(catalog, settings, "extractor", EXTRACTOR_JOBS, lambda *_: None)
-    while not stop.is_set() and not runner.run_once(runner.has_jobs, stop):
-        wakeups.wait(IDLE_POLL_SECONDS)
 
 
 def _create_authenticator(

@@ -131,7 +131,7 @@ class Catalog:
             self.engine = make_postgres_engine(self.url, pool)
         self._sessions = sessionmaker(expire_on_commit=False)
         self._bind(limits)
-        # SQLite has one writer: between threads, a lock does not poll, unlike SQLite's busy handler.
+        # SQLite has one writer: among threads a lock does not poll, unlike SQLite's busy handler.
         self._sqlite_writer = threading.Lock()
         self.commits = CommitSignal()
 
