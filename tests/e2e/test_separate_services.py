@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx2
+import psutil
 import pytest
 
 from tests.support.photos import photo_bytes
@@ -170,7 +171,7 @@ def test_services_in_processes_of_their_own_do_what_the_embedded_one_does(
             "steward",
             ["wakeups", "steward", "collect_orphans", "evaluator", "batches", "webhooks"],
         ),
-        ("serve", ["search", "extractor", "steward", "collect_orphans"]),
+        ("serve", ["search", "extractor", "extractor process", "steward", "collect_orphans"]),
     ],
 )
 def test_a_thread_that_crashes_ends_its_process(
@@ -186,6 +187,9 @@ def test_a_thread_that_crashes_ends_its_process(
     for number, process in enumerate(processes):
         deployment.announced(service, number, r"Placewise (.*(serves|is running))")
         process.send_signal(signal.SIGRTMIN)
+        if threads[number] == "extractor" and service == "serve":
+            (extractor,) = psutil.Process(process.pid).children()
+            extractor.send_signal(signal.SIGRTMIN)
     for number, (name, process) in enumerate(zip(threads, processes, strict=True)):
         log = deployment.root / f"{service}-{number}.log"
         assert process.wait(timeout=SECONDS) == 1, f"{name}: {log.read_text()[-3000:]}"

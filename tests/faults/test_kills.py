@@ -101,6 +101,20 @@ def test_decoding_children_end_with_a_killed_server(tmp_path: Path) -> None:
         wait_until(lambda: all(has_ended(child) for child in children), 20)
 
 
+def test_a_server_whose_extractor_is_killed_ends_and_describes_the_photo_when_started_again(
+    tmp_path: Path,
+) -> None:
+    with ServerProcess(tmp_path / "home") as server:
+        server.indexed(photo_bytes(1))
+        (extractor,) = psutil.Process(server.process.pid).children()
+        uploaded = server.upload(photo_bytes(2)).json()
+        extractor.kill()
+        assert server.process.wait(60) == 1
+        assert "extractor_ended: The extractor's process ended with code -9" in server.log()
+        server.start()
+        assert server.finished(uploaded["job_id"])["state"] == "succeeded"
+
+
 def assert_each_finds_itself(server: ServerProcess, acknowledged: dict[int, str]) -> None:
     for number in range(0, PHOTOS, 10):
         found = server.ask(photo_bytes(number), top_k=2).json()["similar_images"]
