@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import ExitStack
 from enum import StrEnum
 from pathlib import Path
@@ -72,6 +73,14 @@ def reconstruct(
             help="With --import: upload the photos of this folder first.",
         ),
     ] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LAT,LON,ALT",
+            help="With --import: where the model's zero is, if its axes are east, north and up in "
+            "metres. Without it, the model is aligned to the coordinates of its photos.",
+        ),
+    ] = None,
     from_scratch: Annotated[
         bool,
         typer.Option(
@@ -96,14 +105,18 @@ def reconstruct(
     Photos that show the same are reconstructed together and aligned to their coordinates. A later
     run adds the photos that are new. Interrupted, it goes on from its last step.
     """
-    options = {"--import": model, "--images": images, "--from-scratch": from_scratch}
-    given = [name for name, value in options.items() if value]
-    if (images and not model) or (proposals and given) or (model and from_scratch):
+    with_import = images or origin
+    alone = [bool(proposals), from_scratch]
+    if (with_import and not model) or sum(alone) > 1 or (any(alone) and model):
         raise InvalidRequest(
             "options_contradict",
-            "--images goes with --import; --from-scratch and --proposals go with no other option.",
+            "--images and --origin go with --import; --from-scratch and --proposals go with no "
+            "other option.",
         )
+    place = None if origin is None else _parse_origin(origin)
     poses = read_colmap_model(model) if model else None  # fails before anything is uploaded
+    if poses is not None and place is not None:
+        poses = poses.model_copy(update={"origin": place})
     if model and (model / "images.bin").exists() and (model / "images.txt").exists():
         print_note(f"{model} has text files, too. As COLMAP does, the binary files are read.")
     with ExitStack() as stack:
@@ -127,6 +140,21 @@ def reconstruct(
         options_shown = ("reconstruct", "--proposals", "list")
         command = client_command(*options_shown, server=server, map_name=map_name)
         print_note(f"The coordinates of {made.proposals} photos disagree with it: {command}")
+
+
+def _parse_origin(text: str) -> tuple[float, ...]:
+    try:
+        latitude, longitude, altitude_m = place = tuple(map(float, text.split(",")))
+        is_place = abs(latitude) <= 90 and abs(longitude) <= 180 and math.isfinite(altitude_m)
+    except ValueError:
+        is_place = False
+    if not is_place:
+        raise InvalidRequest(
+            "bad_origin",
+            f"--origin {text!r:.50} is no latitude, longitude and altitude: send degrees, degrees "
+            "and metres, such as 45.0693,7.6853,241.5.",
+        )
+    return place
 
 
 def _start(client: Client, poses: ColmapModel | None, from_scratch: bool) -> UUID:
@@ -174,6 +202,8 @@ def _print_reconstruction(made: Reconstruction, result: Json) -> None:
 
 
 def _format_alignment(component: Component) -> str:
+    if not component.located:
+        return "at the given origin"
     text = (
         f"{component.alignment_rms_m:.2f} m from the coordinates of {component.agreeing} of "
         f"{component.located} photos"

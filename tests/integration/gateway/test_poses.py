@@ -497,5 +497,7 @@ def test_a_track_takes_the_pose_of_a_frame_as_a_fix_unless_a_better_one_was_meas
         at = (fix["latitude"], fix["longitude"])
         assert distance_m(place.latitude, place.longitude, *at) < 0.5
         assert 0 < fix["accuracy_m"] < 1
+        assert fix["radius_95_m"] > fix["accuracy_m"]
+        assert 0 <= fix["heading"] < 360
     exact = fix_of(5, **measured, accuracy_m=0.01)
-    assert exact == {**measured, "accuracy_m": 0.01}
+    assert exact == {**measured, "accuracy_m": 0.01, "radius_95_m": None, "heading": None}
