@@ -119,7 +119,9 @@ class _Fit:
         self.seen[~in_front, 2] = np.inf
         self.errors = (self.pixels - self.camera.project(self.seen)) / self.unit
         squares = np.where(in_front, np.sum(self.errors**2, axis=1), np.inf)
-        self.cost = float(np.minimum(squares, MAX_ERROR_PIXELS**2).sum())
+        # Cauchy's loss tells apart poses of as many inliers by those that agree closely.
+        bounded = np.minimum(squares, MAX_ERROR_PIXELS**2)
+        self.cost = float(np.log1p(bounded / LOSS_SCALE_PIXELS**2).sum())
         self.is_inlier: NDArray[np.bool_] = squares < MAX_ERROR_PIXELS**2
 
     def refine(self, focal_sigma: float | None) -> None:
