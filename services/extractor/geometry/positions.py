@@ -121,7 +121,7 @@ def _move_to_positions(
     distances = np.linalg.norm((found.apply(centres) - positions[known])[:, :2], axis=1)
     sigma = max(MIN_PRIOR_SIGMA_M, float(np.median(distances)) / RAYLEIGH_MEDIAN)
     priors, places = [], with_heights(positions)
-    for row in known:
+    for row in known.tolist():
         up = sigma if np.isfinite(positions[row, 2]) else UNKNOWN_ALTITUDE_SIGMA_M
         priors.append(
             pycolmap.PosePrior(
