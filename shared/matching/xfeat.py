@@ -38,12 +38,14 @@ class XFeatDetector(Detector):
         with self._network.net.keypoint_head.register_forward_hook(keep_response):
             found = self._network.detectAndCompute(self.to_images(pixels))
         return [
-            (_refine(each["keypoints"], response, pixels.shape[1:3]), each["descriptors"])
+            (refine_keypoints(each["keypoints"], response, pixels.shape[1:3]), each["descriptors"])
             for each, response in zip(found, *responses, strict=True)
         ]
 
 
-def _refine(keypoints: torch.Tensor, response: torch.Tensor, size: tuple[int, ...]) -> torch.Tensor:
+def refine_keypoints(
+    keypoints: torch.Tensor, response: torch.Tensor, size: tuple[int, ...]
+) -> torch.Tensor:
     """Return (n, 2) keypoints at the peak of the response (H', W') around their pixel.
 
     The response has a maximum there, and the peak is that of the parabola along each axis.
