@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from contextlib import ExitStack
 from enum import StrEnum
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Annotated
 from uuid import UUID
 
 import typer
+from pydantic import TypeAdapter, ValidationError
 from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Column
@@ -35,7 +35,7 @@ from services.cli.output import (
     progress_bar,
 )
 from shared.errors import Conflict, InvalidRequest
-from shared.geometry.colmap_model import ColmapModel, read_colmap_model
+from shared.geometry.colmap_model import ColmapModel, Origin, read_colmap_model
 
 MAX_NAMES_SHOWN = 5
 NAMES_MEANING = {
@@ -105,9 +105,8 @@ def reconstruct(
     Photos that show the same are reconstructed together and aligned to their coordinates. A later
     run adds the photos that are new. Interrupted, it goes on from its last step.
     """
-    with_import = images or origin
-    alone = [bool(proposals), from_scratch]
-    if (with_import and not model) or sum(alone) > 1 or (any(alone) and model):
+    with_import, given = images or origin, model or from_scratch
+    if (with_import and not model) or (proposals and given) or (model and from_scratch):
         raise InvalidRequest(
             "options_contradict",
             "--images and --origin go with --import; --from-scratch and --proposals go with no "
@@ -142,19 +141,15 @@ def reconstruct(
         print_note(f"The coordinates of {made.proposals} photos disagree with it: {command}")
 
 
-def _parse_origin(text: str) -> tuple[float, ...]:
+def _parse_origin(text: str) -> Origin:
     try:
-        latitude, longitude, altitude_m = place = tuple(map(float, text.split(",")))
-        is_place = abs(latitude) <= 90 and abs(longitude) <= 180 and math.isfinite(altitude_m)
-    except ValueError:
-        is_place = False
-    if not is_place:
+        return TypeAdapter(Origin).validate_python(tuple(text.split(",")))
+    except ValidationError as error:
         raise InvalidRequest(
             "bad_origin",
             f"--origin {text!r:.50} is no latitude, longitude and altitude: send degrees, degrees "
             "and metres, such as 45.0693,7.6853,241.5.",
-        )
-    return place
+        ) from error
 
 
 def _start(client: Client, poses: ColmapModel | None, from_scratch: bool) -> UUID:

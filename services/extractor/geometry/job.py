@@ -60,14 +60,7 @@ from shared.errors import NotFound, Unprocessable
 from shared.geometry.cameras import Floats, Rays, hash_camera_key
 from shared.geometry.colmap_model import ColmapModel
 from shared.geometry.component import Component
-from shared.geometry.frames import (
-    GPS_SIGMA_M,
-    Alignment,
-    EastNorthUp,
-    align,
-    align_at,
-    plane_at,
-)
+from shared.geometry.frames import GPS_SIGMA_M, Alignment, EastNorthUp, align, align_at, plane_at
 from shared.geometry.radius import PoseCalibration
 from shared.ids import new_id
 from shared.imaging.photo_header import read_photo_header

@@ -17,11 +17,7 @@ from shared.catalog.photos import Photo
 from shared.catalog.reconstructions import ReconstructedComponent, current_reconstruction
 from shared.errors import PlacewiseError
 from shared.geometry.cameras import CameraSource
-from shared.responses.similarity import (
-    CameraPoseResponse,
-    EstimateResponse,
-    PoseCameraResponse,
-)
+from shared.responses.similarity import CameraPoseResponse, EstimateResponse, PoseCameraResponse
 from shared.search_api.protocol import (
     ComponentPose,
     GeographicPose,

@@ -78,7 +78,7 @@ def test_principal_point_and_distortion_of_a_query_are_estimated_with_its_pose(
 ) -> None:
     query, _ = scene.take(ROTATION, CENTRE, replace(CAMERA, radial=-0.04))
     shift = round(0.005 * FULL_SIDE)  # turns a pose that does not know it by 0.4 degrees
-    shifted = replace(query, positions=np.clip(query.positions + (shift, 0), 0, FULL_SIDE))
+    shifted = replace(query, positions=np.clip(np.add(query.positions, (shift, 0)), 0, FULL_SIDE))
     camera = Camera.of_focal_length(query.width, query.height, CAMERA.focal_length)
     source = CameraSource.GIVEN
     pose = found(localise(shifted, scene.candidates, [scene.component], camera, source, MATCHER))
