@@ -184,7 +184,7 @@ class _Fit:
         """
         rows, errors, _ = self._linearise(priors)
         count = len(errors)
-        variance = float(np.sum(errors**2)) / max(1, 2 * count - 7)
+        variance = float(np.sum(errors**2)) / max(1, 2 * count - PARAMETERS)
         normal = np.einsum("mik,mil->kl", rows, rows) / max(variance, 1e-6)
         normal += np.diag(priors)
         covariance = np.linalg.pinv(normal, hermitian=True)

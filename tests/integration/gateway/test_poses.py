@@ -192,7 +192,7 @@ def test_component_without_coordinates_gives_a_pose_in_its_frame_and_the_reason(
     assert reason in problem(answer, 422, "no_pose")["detail"]
 
 
-def look_elsewhere(service: Service, **place: Any) -> None:
+def look_elsewhere(service: Service, place: dict[Any, Any]) -> None:
     """Make every query look as if the map, whose photos are at this place, lacked its place."""
     others = (0.0,) * (len(shipped_prior().level) - 1)
     model = PlaceModel(
@@ -220,7 +220,7 @@ def test_enough_points_outweigh_that_coordinates_look_elsewhere(
 ) -> None:
     monkeypatch.setattr(similarity_pose, "POINTS_TO_DOUBLE_ODDS", needed)
     reconstruct(service, scene, ids)
-    look_elsewhere(service, latitude=45.0, longitude=7.7)
+    look_elsewhere(service, {"latitude": 45.0, "longitude": 7.7})
     answer = ask(service, take_query(scene))
     assert (answer["pose"] is None) == (needed == 1000)
     assert answer["no_pose"] is None or "would be needed" in answer["no_pose"]
@@ -267,7 +267,7 @@ def test_query_without_a_pose_is_answered_with_the_reason(
 
         monkeypatch.setattr(service.search, "estimate_pose", fail)
     elif case == "floor that the map lacks":
-        look_elsewhere(service, place="hall")
+        look_elsewhere(service, {"place": "hall"})
     elif case == "filtered":
         params = {"ids": ids[-1]}
     answer = ask(service, features, **params)
