@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from services.extractor.child_process import run_in_child
 from services.extractor.geometry.evidence import agreeing_pairs
 from services.extractor.geometry.matching import VerifiedMatches
-from services.extractor.geometry.positions import adjust, misplaced_photos
+from services.extractor.geometry.positions import adjust_to_positions, misplaced_photos
 from shared.errors import Misconfigured, Unprocessable
 from shared.geometry.cameras import UNKNOWN_FOCAL_LENGTH, Camera, Floats, Rays
 from shared.geometry.component import (
@@ -245,7 +245,7 @@ def _map(
                 again = attempt(_with_cameras_of(anew[0], photos), True, rest)
                 anew = max(anew, again, key=_registered)
             for each in anew:
-                adjust(pycolmap, each, photos)
+                adjust_to_positions(pycolmap, each, photos)
             judge = partial(misplaced_photos, photos=photos, matches=matches, is_used=is_used)
             judged = [judge(_component_of(each, by_name)) for each in anew]
             wrong = np.any([contradicts for _, contradicts in judged], axis=0)

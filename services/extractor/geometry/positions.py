@@ -75,30 +75,25 @@ def misplaced_photos(
     return names, contradicts & is_used
 
 
-def adjust(pycolmap: Any, model: Any, photos: Sequence[PhotoToMap]) -> None:
-    """Adjust a model so that wrong observations hardly count, with its photos' positions as priors.
+def adjust_to_positions(pycolmap: Any, model: Any, photos: Sequence[PhotoToMap]) -> None:
+    """Move a model to the positions of its photos, and adjust it with these as priors.
 
-    If there are some, the model is moved to them first. Their standard deviation is that of the
-    model's distances from them.
+    Their standard deviation is that of the model's distances from them. Wrong observations hardly
+    count.
     """
     images = [model.image(number) for number in sorted(model.reg_image_ids())]
+    priors = _move_to_positions(pycolmap, model, images, photos)
+    if not priors:
+        return
     config = pycolmap.BundleAdjustmentConfig()
     for image in images:
         config.add_image(image.image_id)
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = LOSS_SCALE_PIXELS
-    priors = _move_to_positions(pycolmap, model, images, photos)
-    if priors:
-        of_priors = pycolmap.PosePriorBundleAdjustmentOptions()
-        of_priors.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        adjuster = pycolmap.create_pose_prior_bundle_adjuster(
-            options, of_priors, config, priors, model
-        )
-    else:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
-    adjuster.solve()
+    of_priors = pycolmap.PosePriorBundleAdjustmentOptions()
+    of_priors.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    pycolmap.create_pose_prior_bundle_adjuster(options, of_priors, config, priors, model).solve()
     model.update_point_3d_errors()
 
 
