@@ -188,11 +188,8 @@ def run_similarity_search(
     rankings = _rank_photos(search, search_params)
     matches = _match_best_photos(search, rankings, search_params)
     estimate, probabilities = _estimate(search, rankings, matches, search_params)
-    # Along coordinates, queries of another season look as if they were not in the map.
-    is_labelled = bool(estimate.levels) and estimate.levels[0].radius_m is None
-    is_missing = is_labelled and estimate.in_map is False
     candidates = _pose_candidates(search, rankings, search_params)
-    pose = find_pose(gateway, query, candidates, search_params, is_missing=is_missing)
+    pose = find_pose(gateway, query, candidates, search_params, estimate)
     similar = rankings.similar
     if isinstance(pose, CameraPoseResponse):
         estimate = place_at_pose(estimate, pose)
