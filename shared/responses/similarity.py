@@ -167,7 +167,7 @@ class EstimateResponse(ResponseModel):
     calibration_source: str | None = Field(
         None,
         description="what determines the probabilities most: `own_photos` or `labelled_queries` of "
-        "this map, or the `prior` of generated maps, near which a map of fewer than 200 evaluated "
+        "this map, or the `prior` of other maps, near which a map of fewer than 2,000 evaluated "
         "photos stays; null without levels",
     )
 

@@ -9,7 +9,7 @@ regression on the features of the ranking (`level_features`). All probabilities 
 and add up to one: a level's is that of "in this map" times its own, and a level that contains the
 whole map says that the query is in it.
 
-`fit` fits the levels to a map; without a fit, the coefficients are those of generated maps.
+`fit` fits the levels to a map; without a fit, the coefficients are those of other maps.
 `thresholds` decides which level is the answer.
 """
 
@@ -58,7 +58,7 @@ OUT_OF_MAP_SHARE = 0.02  # of the frames of tracks, and of queries before a map 
 UNMAPPED_SHARE = 0.05  # of queries within the map's extent whose place has no photo
 ELSEWHERE_SHARE = 0.33  # of queries that are from elsewhere, unless the caller says otherwise
 DEFAULT_CERTAINTY = 0.95
-SMALL_MAP_PHOTOS = 200  # with fewer, the coefficients stay near the prior's
+SMALL_MAP_PHOTOS = 2000  # with fewer, the coefficients stay near the prior's
 PRIOR_FILE = Path(__file__).with_name("prior.json")
 
 Coefficients = tuple[float, ...]
@@ -163,17 +163,23 @@ class MapExtent(BaseModel):
 
 
 class PlacePrior(BaseModel):
-    """Coefficients that were fitted on generated maps, and the standardisation of the features."""
+    """Coefficients that were fitted on other maps, and the standardisation of the features."""
 
     model_config = ConfigDict(frozen=True)
 
     means: tuple[float, ...]
     scales: tuple[float, ...]
     level: Coefficients
+    matched: Coefficients = ()
+    """those of a level with matches"""
     missing_place: Coefficients
     """log-odds that the map has no photo of the place, if that holds for half of the queries"""
     elsewhere: dict[str, Elsewhere] = {}
     """by extractor, for maps with a vocabulary of their own; "" for all others"""
+
+    def level_coefficients(self, features: int) -> Coefficients:
+        """Return those of a level with so many features."""
+        return self.matched if features > len(FEATURES) else self.level
 
     def design(self, features: FloatArray) -> FloatArray:
         """Return the (n, 1 + F) design matrix of (n, F) features; those of matches stay as they
@@ -265,14 +271,16 @@ class PlaceModel(BaseModel):
             levels: Those of `MapExtent.end_levels`.
             elsewhere: Prior probability that a query is from elsewhere.
         """
-        prior = shipped_prior()
+        prior, fitted = shipped_prior(), dict(enumerate(self.levels))
         missing = self.elsewhere.probability(levels, elsewhere) if self.elsewhere else elsewhere
         if self.is_fitted:  # Laplace's rule of succession
             missing = max(missing, 1 / (self.own_photos + self.labelled_queries + 2))
         single = [
             1.0
             if level.is_whole_map
-            else sigmoid(_log_odds(self.levels[i] if i < len(self.levels) else prior.level, level))
+            else sigmoid(
+                _log_odds(fitted.get(i, prior.level_coefficients(len(level.features))), level)
+            )
             for i, level in enumerate(levels)
         ]
         increasing = (1 - missing) * np.maximum.accumulate(np.array(single))
