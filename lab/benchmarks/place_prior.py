@@ -11,21 +11,19 @@ are, without and with matches,
   photos do not show how weak the evidence of a right answer can be;
 - what photos of elsewhere score (`Elsewhere`). The intercept is raised by what the worst pair of
   a map and a set needs with coefficients that were fitted without both, so that at most one in
-  twenty of its photos is said to be in the map. A table shows what passes of each pair then.
+  twenty of its photos is said to be in the map.
 
 With `--missing-place`, the features are standardised and the log-odds of a missing place fitted, on
 generated cities (`placewise datasets synth CITY --no-train --seed 1 ...`). Each is sampled once
 with its coordinates, and once with label paths, which are squares of 400 m and 100 m and the place.
-
-Only coefficients are stored.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from itertools import chain
 from math import cos, log, radians
 from pathlib import Path
@@ -36,7 +34,7 @@ from rich.progress import Progress
 
 from lab.benchmarks.estimates import FOREIGN_PHOTOS, DescribedPhotos, TrialMap, describe_sets
 from lab.benchmarks.matches import MatchedPhotos, detect_all
-from services.cli.output import Table, console, print_table
+from services.cli.output import console
 from shared.evaluation.places.evidence import PhotoLocation
 from shared.evaluation.places.fit import (
     PlaceSample,
@@ -49,7 +47,6 @@ from shared.evaluation.places.probability import (
     ELSEWHERE_SHARE,
     PRIOR_FILE,
     Coefficients,
-    Elsewhere,
     PlacePrior,
     shipped_prior,
 )
@@ -67,44 +64,23 @@ MAP_WEIGHT = 300.0  # of a map's own photos and queries, and of all photos of el
 PRECISION = 2.0  # of each coefficient of a level
 MISSING_PRECISION = 50.0  # features that vary together would get large ones of both signs
 
-MapSamples = Mapping[str, Sequence[PlaceSample]]
-"""Samples of a map's own photos, of its queries, and of the photos of each other set."""
-MapFeatures = tuple[str, Mapping[str, FloatArray]]
-"""The name of a map, and for each of these the (n, F) features of `Elsewhere`."""
+MapSamples = Mapping[str, Sequence[PlaceSample]]  # of OWN, QUERIES, and each other set
 
 
-def _sample_city(city: DescribedPhotos) -> list[PlaceSample]:
-    """Sample a city with coordinates and with label paths."""
+def _sample_city(city: DescribedPhotos) -> Iterator[PlaceSample]:
+    """Sample the photos and the queries of a city, with coordinates and with label paths."""
     paths = replace(
         city,
         locations=[PhotoLocation(None, None, _square_path(spot)) for spot in city.locations],
         scheme=LevelScheme(labels_are_paths=True, radii_m=city.scheme.radii_m),
     )
-    return [*_sample_map(city), *_sample_map(paths)]
-
-
-def _sample_map(photos: DescribedPhotos) -> list[PlaceSample]:
-    """Sample the database photos and the queries of a city."""
-    trial = TrialMap(photos, photos.is_database)
-    samples, spread = trial.own_samples()
-    for query in np.flatnonzero(photos.is_query).tolist():
-        sample = trial.query_sample(query, spread)
-        samples.append(sample if trial.has_place(query) else replace(sample, left_out="outside"))
-    return samples
-
-
-def _fit_missing_place(samples: Sequence[PlaceSample]) -> PlacePrior:
-    """Standardise the features of all levels, and fit the log-odds of a missing place."""
-    features = np.array([level.features for sample in samples for level in sample.levels])
-    standard = shipped_prior().model_copy(
-        update={
-            "means": tuple(features.mean(axis=0).round(4).tolist()),
-            "scales": tuple(np.maximum(features.std(axis=0), 1e-6).round(4).tolist()),
-        }
-    )
-    zeros = (0.0,) * (1 + len(FEATURES))
-    missing = fit_map_estimate(missing_place_table(samples), zeros, standard, MISSING_PRECISION)
-    return standard.model_copy(update={"missing_place": _rounded(missing)})
+    for photos in (city, paths):
+        trial = TrialMap(photos, photos.is_database)
+        samples, spread = trial.own_samples()
+        yield from samples
+        for query in np.flatnonzero(photos.is_query).tolist():
+            sample = trial.query_sample(query, spread)
+            yield sample if trial.has_place(query) else replace(sample, left_out="outside")
 
 
 def map_samples(photos: DescribedPhotos) -> MapSamples:
@@ -142,37 +118,30 @@ def fit_levels(maps: Iterable[MapSamples]) -> Coefficients:
 
 
 def _thinned(numbers: Sequence[int], most: int) -> Sequence[int]:
-    """Return every n-th of them, at most `most`."""
     return numbers[:: -(-len(numbers) // most) or 1]
 
 
-def fit_elsewhere(maps: Sequence[MapFeatures]) -> Coefficients:
-    """Fit the log-odds of "elsewhere" on the features of the photos of each set, by map.
+def fit_elsewhere(maps: Sequence[tuple[str, Mapping[str, FloatArray]]]) -> Coefficients:
+    """Fit the log-odds of "elsewhere" on the (n, F) features of the photos of each set, by map.
 
-    The intercept is raised by what the worst pair needs (see the module).
+    The intercept is raised by what the worst pair needs (see the module), which is printed.
     """
     intercept, *slopes = _fit_log_odds(each for _, each in maps)
-    # As in conformal prediction, one more photo, which passes, is counted.
-    least = [
-        np.sort(log_odds)[max(0, (len(log_odds) + 1) // 20 - 1)]
-        for _, asked, log_odds in held_out_log_odds(maps)
-        if asked != QUERIES and len(log_odds) >= MIN_PHOTOS
-    ]
-    return _rounded([intercept + max(0.0, PASSING + 0.001 - min(least)), *slopes])
-
-
-def held_out_log_odds(maps: Sequence[MapFeatures]) -> Iterator[tuple[str, str, FloatArray]]:
-    """Yield each map, each set, and the log-odds of its photos before the intercept is raised.
-
-    The coefficients are fitted without both.
-    """
+    worst = (0.0, "no pair")
     for name, asked, features in ((name, k, v) for name, each in maps for k, v in each.items()):
-        intercept, *slopes = _fit_log_odds(
-            {k: v for k, v in each.items() if k not in (name, asked) or k == QUERIES}
+        if asked == QUERIES or len(features) < MIN_PHOTOS:
+            continue
+        held_out = _fit_log_odds(
+            {k: v for k, v in each.items() if k not in (name, asked)}
             for other, each in maps
             if other not in (name, asked)
         )
-        yield name, asked, intercept + features @ np.array(slopes)
+        log_odds = np.sort(held_out[0] + features @ np.array(held_out[1:]))
+        # As in conformal prediction, one more photo, which passes, is counted.
+        least = log_odds[max(0, (len(log_odds) + 1) // 20 - 1)]
+        worst = max(worst, (float(PASSING + 0.001 - least), f"{asked} in {name}"))
+    console.print(f"{worst[1]}: the intercept is raised by {worst[0]:.3f}")
+    return _rounded([intercept + worst[0], *slopes])
 
 
 def _fit_log_odds(maps: Iterable[Mapping[str, FloatArray]]) -> Coefficients:
@@ -207,15 +176,14 @@ def main(folders: Sequence[Path]) -> None:
     def features(path: Path) -> LocalFeatures:
         return detect_all(detector, [path], lambda: None)[0][0]
 
-    def features_of(paths: Sequence[Path]) -> Callable[[int], LocalFeatures]:
-        return lambda number: features(paths[number])
-
-    found: dict[tuple[str, str], list[MapFeatures]] = {}
+    found: dict[tuple[str, str], list[tuple[str, Mapping[str, FloatArray]]]] = {}
     levels: dict[str, list[MapSamples]] = {"level": [], "matched": []}
     with Progress(console=console) as progress:
         for photos in chain(*(describe_sets(folders, progress, own) for own in (True, False))):
             background = TrialMap(photos, photos.is_database).background
-            matched = MatchedPhotos(features_of(photos.paths), matcher)
+            matched = MatchedPhotos(
+                partial(lambda paths, n: features(paths[n]), photos.paths), matcher
+            )
             kinds = {"coefficients": None, "matched": matched.match}
             for kind, match in list(kinds.items())[: 2 if photos.extractor else 1]:
                 samples = map_samples(replace(photos, match=match))
@@ -224,42 +192,35 @@ def main(folders: Sequence[Path]) -> None:
                 for extractor in {"", photos.extractor}:
                     unit = prior.elsewhere[extractor]
                     unit = unit.model_copy(update={"background": unit.background or background})
-                    described = describe_elsewhere(unit, samples)
+                    # Few queries of another day are as similar as the map's own photos.
+                    described = {
+                        name: np.array([unit.features(sample.levels) for sample in each])
+                        for name, each in samples.items()
+                        if each and name != OWN
+                    }
                     found.setdefault((extractor, kind), []).append((photos.name, described))
     elsewhere = dict(prior.elsewhere)
     for (extractor, kind), maps in found.items():
-        fitted = fit_elsewhere(maps)
-        elsewhere[extractor] = elsewhere[extractor].model_copy(update={kind: fitted})
-        raised = fitted[0] - _fit_log_odds(each for _, each in maps)[0]
-        table = Table("map", "photos of", "number", "passing, %", title=f"{extractor} {kind}")
-        for name, asked, log_odds in held_out_log_odds(maps):
-            passing = f"{100 * np.mean(log_odds + raised <= PASSING):.1f}"
-            table.add_row(name, asked, str(len(log_odds)), passing)
-        print_table(table)
+        update = {kind: fit_elsewhere(maps)}
+        elsewhere[extractor] = elsewhere[extractor].model_copy(update=update)
     fits = {name: fit_levels(each) for name, each in levels.items()}
-    _write(prior.model_copy(update={"elsewhere": elsewhere, **fits}))
-
-
-def describe_elsewhere(unit: Elsewhere, samples: MapSamples) -> dict[str, FloatArray]:
-    """Return the (n, F) features of `Elsewhere` of the queries and the other sets of a map.
-
-    Its own photos are left out: so similar are few queries of another day.
-    """
-    return {
-        name: np.array([unit.features(sample.levels) for sample in each])
-        for name, each in samples.items()
-        if each and name != OWN
-    }
+    _write(prior.model_copy(update=fits | {"elsewhere": elsewhere}))
 
 
 def fit_missing_place(folders: Sequence[Path]) -> None:
-    """Describe and sample the cities, and write the log-odds of a missing place."""
-    samples: list[PlaceSample] = []
+    """Standardise the features of all levels of cities, and fit the log-odds of a missing place."""
     with Progress(console=console) as progress:
-        for city in describe_sets(folders, progress):
-            samples += _sample_city(city)
-            console.print(f"{city.name}: {len(samples)} samples so far")
-    _write(_fit_missing_place(samples))
+        samples = list(chain(*(_sample_city(city) for city in describe_sets(folders, progress))))
+    features = np.array([level.features for sample in samples for level in sample.levels])
+    standard = shipped_prior().model_copy(
+        update={
+            "means": tuple(features.mean(axis=0).round(4).tolist()),
+            "scales": tuple(np.maximum(features.std(axis=0), 1e-6).round(4).tolist()),
+        }
+    )
+    zeros = (0.0,) * (1 + len(FEATURES))
+    missing = fit_map_estimate(missing_place_table(samples), zeros, standard, MISSING_PRECISION)
+    _write(standard.model_copy(update={"missing_place": _rounded(missing)}))
 
 
 def _write(prior: PlacePrior) -> None:

@@ -25,6 +25,7 @@ import numpy as np
 
 from shared.evaluation.places.levels import CandidateLevel, FloatArray, LevelScheme
 from shared.evaluation.places.probability import (
+    MIN_LABELLED_QUERIES,
     UNMAPPED_SHARE,
     Background,
     Coefficients,
@@ -43,12 +44,12 @@ from shared.evaluation.places.thresholds import (
 )
 
 MIN_OWN_PHOTOS = 20
-MIN_LABELLED_QUERIES = 40
 PRIOR_PRECISION = 2.0  # of each coefficient of a standardised feature
 OWN_PRECISION = 20.0  # the same for own photos, which do not show how queries of other days differ
 ELSEWHERE_PRECISION = 0.2  # what is known of another extractor says little
 NEWTON_STEPS = 50
 FOLDS = 5
+QUANTILES = 101  # of the scores of best photos
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +116,15 @@ def fit_place_model(
     judged = labelled_held_out or own_held_out
     thresholds = tuple(choose_threshold(judged, certainty) for certainty in CERTAINTIES)
     fitted = _fit_coefficients(samples, labelled, scheme, scores)
-    model = fitted.model_copy(update={"thresholds": thresholds})
+    best = [s.levels[0].best_score for s in labelled or samples if s.left_out is None]
+    quantiles = np.quantile(best, np.linspace(0, 1, QUANTILES)) if best else np.zeros(0)
+    model = fitted.model_copy(
+        update={
+            "thresholds": thresholds,
+            "wrong_until": tuple(each.wrong_until for each in labelled_held_out),
+            "best_scores": tuple(quantiles.round(4).tolist()),
+        }
+    )
     in_map = labelled_held_out or [s for s in own_held_out if s.left_out is None]
     return FittedPlaceModel(model, in_map, impostors)
 
