@@ -29,8 +29,8 @@ from shared.evaluation.places.levels import (
     shared_neighbours,
 )
 from shared.evaluation.places.probability import (
-    MIN_LABELLED_QUERIES,
     ELSEWHERE_SHARE,
+    MIN_LABELLED_QUERIES,
     Background,
     Elsewhere,
     MapExtent,
