@@ -177,10 +177,15 @@ class EstimateResponse(ResponseModel):
         "probability of 68 %; null without coordinates, or if it exceeds the largest level",
     )
     radius_95_m: float | None = Field(None, description="the same with 95 %")
+    new_to_map: bool = Field(
+        False,
+        description="whether the map's last searches are less similar to it than the photos that "
+        "its probabilities were measured on; `reason` says so",
+    )
     calibration_source: str | None = Field(
         None,
         description="what determines the probabilities most: `own_photos` or `labelled_queries` of "
-        "this map, or the `prior` of generated maps, near which a map of fewer than 200 evaluated "
+        "this map, or the `prior` of other maps, near which a map of fewer than 2,000 evaluated "
         "photos stays; null without levels",
     )
 

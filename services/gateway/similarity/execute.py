@@ -31,7 +31,14 @@ from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import find_descriptor
 from shared.catalog.database.errors import to_unavailable
 from shared.catalog.generations import Generation, RowType, active_generation
-from shared.catalog.maps import Map, Matching, Search, get_map, map_not_found_error
+from shared.catalog.maps import (
+    Map,
+    Matching,
+    Search,
+    get_map,
+    map_not_found_error,
+    recent_best_scores,
+)
 from shared.catalog.photos import Photo, get_live_photos, get_photo
 from shared.catalog.vocabularies import vocabulary_standing
 from shared.errors import Conflict, Gone, StorageFull
@@ -369,7 +376,8 @@ def _estimate(
     query, settings = search.query, search.gateway.settings
     found, whole_map = rankings.found, rankings.whole_map
     model, scheme = _place_model(search)
-    certainty = search_params.certainty or settings.certainty
+    certainty, guarantee = search_params.certainty or settings.certainty, search_params.guarantee
+    model.threshold(certainty, guarantee)  # refuses a guarantee also where nothing is found
     elsewhere = search_params.elsewhere or query.map.elsewhere or ELSEWHERE_SHARE
     neighbours = search.rank_neighbours(whole_map.hits[0].photo_id) if whole_map.hits else ()
     places = model.estimate(
@@ -380,12 +388,15 @@ def _estimate(
         settings.estimate_radius_m,
         matches.add_to(rankings.located.ranking),
         elsewhere,
+        guarantee,
     )
     similar = locate_hits(rankings.similar.hits[: search_params.top_k], rankings.similar.photos)
     if not any(ranked.location.is_known for ranked in similar):
         places = None  # the photos that it would be named after do not look like the query
     reason = _no_place_reason(found.hits, search_params.photos)
-    estimate = estimate_place(places, certainty, elsewhere, reason)
+    with search.gateway.catalog.read() as session:
+        recent = recent_best_scores(session, query.map.id, query.generation.id)
+    estimate = estimate_place(places, certainty, elsewhere, reason, is_new=model.is_new(recent))
     if places is None or not model.is_fitted:
         return estimate, {}
     best = (hit.photo_id for hit in rankings.located.hits)
