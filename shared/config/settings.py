@@ -77,7 +77,7 @@ class ServiceSettings(BaseSettings):
     redis_url: SecretStr | None = Field(
         None,
         description="URL of the Redis that carries job notifications between services; unset: all "
-        "services run in one process",
+        "services run as one server",
     )
     heartbeat_file: Path | None = Field(
         None,

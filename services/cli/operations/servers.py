@@ -1,6 +1,6 @@
 """Commands that run servers: `serve`, `gateway`, `extractor`, `search` and `steward`.
 
-`serve` runs the embedded Placewise in one process. The others run one service each; services share
+`serve` runs the embedded Placewise. The others run one service each; services share
 DATABASE_URL (PostgreSQL), REDIS_URL, the object store and SEARCH_URLS. Each command imports its
 service when it runs: importing takes a second or more, and each image has the packages of its
 service only.
