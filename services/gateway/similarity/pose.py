@@ -119,7 +119,7 @@ def find_pose(
 
 def _points_against(estimate: EstimateResponse) -> int:
     """Return how many points outweigh "not in this map"."""
-    outside = min(estimate.not_in_map_probability or 0.0, MAX_NOT_IN_MAP)
+    outside = min(max(estimate.not_in_map_probability or 0.0, 0.5), MAX_NOT_IN_MAP)
     return math.ceil(POINTS_TO_DOUBLE_ODDS * math.log2(outside / (1 - outside)))
 
 
