@@ -73,6 +73,7 @@ def test_a_photo_has_all_its_metadata(server: ServerProcess, file_id: str) -> No
         "altitude": 238.5,
         "heading": 90,
         "focal_length": None,
+        "given_place": None,
         "place": "yard",
         "role": "database",
         "media_type": "image/jpeg",

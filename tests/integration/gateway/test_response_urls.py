@@ -120,6 +120,7 @@ def test_every_url_in_an_answer_leads_to_its_map(service: Service) -> None:
     call("get_photo", "GET", f"/uploads/{file_id}")
     call("patch_photo", "PATCH", f"/uploads/{file_id}", json={"tags": ["a"]})
     call("search_metadata", "GET", "/search")
+    call("restore_photo", "POST", f"/uploads/{file_id}/restore")
     call("patch_photo", "PATCH", f"/uploads/{file_id}", json={"place": None})
     call("propose_places", "POST", "/places/proposals", json={})
 

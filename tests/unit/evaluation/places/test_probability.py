@@ -222,7 +222,7 @@ def test_an_answer_is_the_finest_level_over_the_threshold_if_the_query_is_in_the
     assert model.answer([0.91, 0.96], 0.04, 0.95) == 0
     assert model.answer([0.91, 0.92], 0.08, 0.95) is None
     assert model.answer([0.5, 0.91], 0.04, 0.95) == 1
-    assert model.answer([0.5, 0.89], 0.04, 0.95) is None
+    assert model.answer([0.5, 0.89], 0.04, 0.95) == 1  # the whole map
     without_thresholds = PlaceModel(source="own_photos")
     assert without_thresholds.answer([0.94, 0.96], 0.04, 0.95) == 1  # the certainty is one
     assert [model.is_in_map(missing) for missing in (0.05, 0.06, 0.5, 0.51)] == [
