@@ -23,7 +23,8 @@ def test_the_status_shows_what_the_map_has_of_the_library_and_why_it_has_not(
         with ServerProcess(tmp_path / "home", **settings) as server:
             page = browser.new_page()
             page.goto(f"{server.client.base_url}#/status")
-            card = page.locator("section.card", has_text="Photo library").first
+            heading = page.get_by_role("heading", name="Photo library")
+            card = page.locator("section.card").filter(has=heading)
             expect(page.get_by_role("heading", name="Status")).to_be_visible()
             expect(card).to_be_hidden()
             body = {"every_hours": 24}
