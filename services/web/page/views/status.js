@@ -27,7 +27,7 @@ export async function showStatus(view, { signal }) {
     drawSearches(drawn.searches, searches);
   };
   await look();
-  fill(view, h("header", { class: "head" }, h("h1", {}, "Status"), h("p", { class: "row" }, h("a", { class: "button", href: "/docs" }, "The API"))), h("div", { class: "status-grid" }, drawn.figures, drawn.health), drawn.jobs, drawn.searches, phoneCard(settings));
+  fill(view, h("header", { class: "head" }, h("h1", {}, "Status"), h("p", { class: "row" }, h("a", { class: "button", href: "/docs" }, "The API"))), h("div", { class: "status-grid" }, drawn.figures, drawn.health), drawn.library, drawn.jobs, drawn.searches, phoneCard(settings));
   const timer = setInterval(() => {
     // Not while someone is at a button of what would be drawn anew.
     if (!document.hidden && ![drawn.jobs, drawn.figures, drawn.library].some((card) => card.contains(document.activeElement))) look().catch((error) => !signal.aborted && drawUnreachable(drawn.health, error));
