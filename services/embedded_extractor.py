@@ -25,6 +25,7 @@ from prometheus_client import CollectorRegistry, Metric, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 from prometheus_client.registry import Collector
 
+from services.extractor.child_process import exit_with_parent
 from services.service_process import (
     SIGNAL_POLL_SECONDS,
     start_service_threads,
@@ -243,7 +244,7 @@ def _run(
     lazy: bool,
     pipes: tuple[Connection, Connection, Connection, Connection],
 ) -> None:
-    threading.Thread(target=_exit_with_server, daemon=True).start()
+    exit_with_parent()
     for number in STOP_SIGNALS:
         signal.signal(number, lambda *_: None)  # not SIG_IGN, which the decoders would inherit
     signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)
@@ -261,10 +262,3 @@ def _run(
         _Extractor(settings, name, send).serve(commands, lazy=lazy)
     except PlacewiseError as error:
         send(error)
-
-
-def _exit_with_server() -> None:
-    server = multiprocessing.parent_process()
-    assert server is not None
-    server.join()
-    os._exit(1)
