@@ -26,6 +26,7 @@ from services.cli.output import (
     MapOption,
     ServerOption,
     Table,
+    first_names,
     format_percent,
     print_failures,
     print_json,
@@ -191,7 +192,7 @@ def _print_reconstruction(made: Reconstruction, result: Json) -> None:
     )
     for what, meaning in NAMES_MEANING.items():
         if names := result.get(f"{what}_names"):
-            shown = ", ".join(names[:MAX_NAMES_SHOWN]) + " ..." * (len(names) > MAX_NAMES_SHOWN)
+            shown = first_names(names, MAX_NAMES_SHOWN)
             why = meaning if made.imported else "photos are in no component"
             print_note(f"{result[what]} {why}: {shown}")
 

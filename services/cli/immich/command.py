@@ -30,6 +30,7 @@ from services.cli.output import (
     MapOption,
     ServerOption,
     TimeZoneOption,
+    first_names,
     print_failures,
     print_note,
     printable_text,
@@ -39,7 +40,6 @@ from shared.config.command_line import command_line
 from shared.errors import Misconfigured
 
 KEY_VARIABLE = "IMMICH_API_KEY"
-SHOWN = 3  # names of photos
 
 
 def immich(
@@ -94,8 +94,7 @@ def immich(
                 message += (
                     f" {len(undone.removed)} photos had none. Immich's API can't take coordinates "
                     "away, so they have 0, 0 now, which Placewise takes for no place: "
-                    f"{', '.join(map(printable_text, undone.removed[:SHOWN]))}"
-                    + (" ..." if len(undone.removed) > SHOWN else "")
+                    f"{printable_text(first_names(undone.removed))}"
                 )
             report_undo(undone, message, as_json)
             return

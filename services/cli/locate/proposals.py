@@ -35,6 +35,7 @@ from services.cli.output import (
     Json,
     Table,
     err_console,
+    first_names,
     format_percent,
     print_json,
     print_message,
@@ -198,8 +199,7 @@ def _print_changes(preview: Preview, accepted: Sequence[LocatedPhoto]) -> None:
         "--write, the photos are searched again. "
         + (
             f"{len(changed)} proposals are not as they were accepted then, because options, photos "
-            f"or the track have changed: {', '.join(changed[:3])}"
-            + (" ..." if len(changed) > 3 else "")
+            f"or the track have changed: {first_names(changed)}"
             if changed
             else "All proposals are as they were then."
         )
@@ -294,9 +294,7 @@ def _print_proposals(
         if accepted:
             print_note(f"Nothing is written. {options.how_to_write} writes them.")
         return
-    names = ", ".join(map(printable_text, written.written[:3])) + (
-        " ..." if len(written.written) > 3 else ""
-    )
+    names = printable_text(first_names(written.written))
     print_note(
         f"{len(written.written)} {options.written_are} written{': ' if names else ''}{names}. "
         f"Undo: {options.undo_command}"
