@@ -103,8 +103,9 @@ def immich(
             f"Indexing Immich {api.version()} at {api.url} into "
             f"{describe_target(client, server, map_name)}"
         )
+        photos = library.list_photos()
         with progress_bar() as progress:
-            indexed = sync_map(client, library, library.list_photos(), progress)
+            indexed = sync_map(client, library, photos, progress)
         if not as_json:
             _print_indexed(indexed)
         options = LocateOptions(
@@ -112,7 +113,7 @@ def immich(
             "--write", command_line("immich", "--url", url, "--undo"), "photos",
         )  # fmt: skip
         complete = locate_library(
-            library, options, lambda: contextlib.nullcontext(client), indexed=indexed
+            library, options, lambda: contextlib.nullcontext(client), photos, indexed=indexed
         )
     if indexed["failed"] or not complete:
         raise typer.Exit(1)

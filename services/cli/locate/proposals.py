@@ -82,11 +82,15 @@ def locate_library(
     library: PhotoLibrary,
     options: LocateOptions,
     open_client: Callable[[], AbstractContextManager[Client]],
+    photos: Sequence[LibraryPhoto] | None = None,
     **more_json: Json,
 ) -> bool:
     """Propose positions for the photos without coordinates, print, and with `write`, write them.
 
     With `write`, the searches are those that the last call without it has shown.
+
+    Args:
+        photos: The library's photos, if they were listed just now.
 
     Returns:
         Whether all photos could be searched and written.
@@ -95,7 +99,7 @@ def locate_library(
         InvalidRequest: `unknown_time_zone`, `bad_gpx`, `bad_motion`.
     """
     moves = parse_motion(options.motion)
-    photos = library.list_photos()
+    photos = library.list_photos() if photos is None else photos
     path = preview_file(
         read_settings().placewise_home, library.identity, options.server, options.map_name
     )
