@@ -394,13 +394,21 @@ def _estimate(
     if not any(ranked.location.is_known for ranked in similar):
         places = None  # the photos that it would be named after do not look like the query
     reason = _no_place_reason(found.hits, search_params.photos)
-    with search.gateway.catalog.read() as session:
-        recent = recent_best_scores(session, query.map.id, query.generation.id)
-    estimate = estimate_place(places, certainty, elsewhere, reason, is_new=model.is_new(recent))
+    is_new = places is not None and _is_new(search, model)
+    estimate = estimate_place(places, certainty, elsewhere, reason, is_new=is_new)
     if places is None or not model.is_fitted:
         return estimate, {}
     best = (hit.photo_id for hit in rankings.located.hits)
     return estimate, dict(zip(best, places.match_probabilities, strict=True))
+
+
+def _is_new(search: _MapSearch, model: PlaceModel) -> bool:
+    """Return whether the recent queries of the map are new to it."""
+    if not model.best_scores:  # the map was not evaluated since scores are kept
+        return False
+    with search.gateway.catalog.read() as session:
+        recent = recent_best_scores(session, search.query.map.id, search.query.generation.id)
+    return model.is_new(recent)
 
 
 def _place_model(search: _MapSearch) -> tuple[PlaceModel, LevelScheme]:
