@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import MAXYEAR, UTC, datetime, timedelta
+from functools import partial
 from typing import Annotated, Any, Self
 from uuid import UUID
 
@@ -41,6 +42,7 @@ from shared.geotagging.locate import (
     PositionFinder,
     picture_evidence,
     probable_label,
+    search_for_position,
 )
 from shared.imaging.capture_place import is_null_island
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS
@@ -163,14 +165,11 @@ def search_for_place(gateway: GatewayContext, map_name: str, photo: Photo) -> Si
         Conflict: `not_searchable`.
     """
     query = query_from_photo(gateway, map_name, photo.id)
-    params = SearchParams(top_k=SIMILAR_PHOTOS, pose=True, history=False)
-    answer = find_similar(gateway, query, params)
-    if answer.matches_without_place:  # they hide photos with coordinates
-        params = SearchParams(top_k=SIMILAR_PHOTOS, photos=WITH_COORDINATES, history=False)
-        located = find_similar(gateway, query, params).similar_images
-        if located:
-            answer = answer.model_copy(update={"similar_images": located})
-    return answer
+    search = partial(find_similar, gateway, query)
+    return search_for_position(
+        lambda: search(SearchParams(top_k=SIMILAR_PHOTOS, pose=True, history=False)),
+        lambda: search(SearchParams(top_k=SIMILAR_PHOTOS, photos=WITH_COORDINATES, history=False)),
+    )
 
 
 def _is_at(photo: SimilarPhotoResponse, proposal: Proposal | None, label: str | None) -> bool:

@@ -5,7 +5,7 @@ The command, the API and the page use this; they differ in where photos come fro
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from shared.geotagging.evidence import (
@@ -54,6 +54,22 @@ class PositionFinder:
         if proposal is None:
             return None, self.neighbours.why_unknown(photo, picture)
         return proposal, proposal.reason
+
+
+def search_for_position(
+    search: Callable[[], SimilarityResponse],
+    search_located: Callable[[], SimilarityResponse],
+) -> SimilarityResponse:
+    """Search a map for the position of a photo.
+
+    Args:
+        search: Searches all photos of the map.
+        search_located: Searches those with coordinates, which similar photos without any may hide.
+    """
+    answer = search()
+    if answer.matches_without_place and (located := search_located().similar_images):
+        return answer.model_copy(update={"similar_images": located})
+    return answer
 
 
 def picture_evidence(answer: SimilarityResponse, photo_count: int) -> PictureEvidence:

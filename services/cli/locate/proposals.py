@@ -51,6 +51,7 @@ from shared.geotagging.locate import (
     PositionFinder,
     picture_evidence,
     probable_label,
+    search_for_position,
 )
 from shared.tracks.motion import parse_motion
 
@@ -169,13 +170,11 @@ def _search_photo(
         raise
     except PlacewiseError as error:
         return SearchedPhoto(error=error.detail)
+    search = partial(client.similar, picture, top_k=SIMILAR_PHOTOS, history=False)
     try:
-        answer = client.similar(picture, top_k=SIMILAR_PHOTOS, pose=True, history=False)
-        if answer.matches_without_place:  # they hide photos with coordinates
-            located = client.similar(
-                picture, top_k=SIMILAR_PHOTOS, box=WITH_COORDINATES, history=False
-            )
-            answer = answer.model_copy(update={"similar_images": located.similar_images})
+        answer = search_for_position(
+            partial(search, pose=True), partial(search, box=WITH_COORDINATES)
+        )
     except PlacewiseError as error:
         if error.status not in (400, 413, 415, 422):  # 400: an empty file
             raise
