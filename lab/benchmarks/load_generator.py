@@ -27,14 +27,27 @@ from shared.jobs import Job, JobKind, JobState
 from tests.support.server import SERVICES_KEY
 
 BOUNDARY = "placewise-bench"
-HEADERS = {
-    "Authorization": f"Bearer {SERVICES_KEY}",
-    "Content-Type": f"multipart/form-data; boundary={BOUNDARY}",
-}
+CONTENT_TYPE = {"Content-Type": f"multipart/form-data; boundary={BOUNDARY}"}
+AUTH_HEADER = {"Authorization": f"Bearer {SERVICES_KEY}"}
 TIMEOUT_SECONDS = 60.0
 MAX_JPEG_QUALITY, MIN_JPEG_QUALITY = 95, 5  # JPEG qualities
 
 _numbers = itertools.count()
+
+
+def connect(url: str) -> HTTPConnection:
+    """Return a persistent connection to a server; use it in one thread."""
+    parts = urlsplit(url)
+    return HTTPConnection(str(parts.hostname), parts.port, timeout=TIMEOUT_SECONDS)
+
+
+def post_form(
+    connection: HTTPConnection, path: str, form: bytes, **headers: str
+) -> tuple[int, bytes]:
+    """Return status and body of the response; OSError or HTTPException if there is none."""
+    connection.request("POST", path, form, {**AUTH_HEADER, **CONTENT_TYPE, **headers})
+    answer = connection.getresponse()
+    return answer.status, answer.read()
 
 
 def make_jpegs(count: int, size: tuple[int, int], size_bytes: int) -> list[bytes]:
@@ -100,14 +113,10 @@ def upload_all(
     answers: dict[int, Any] = {}
 
     def upload() -> None:
-        parts = urlsplit(url)
-        opened = HTTPConnection(str(parts.hostname), parts.port, timeout=TIMEOUT_SECONDS)
-        with contextlib.closing(opened) as connection:
+        with contextlib.closing(connect(url)) as connection:
             for number, form in waiting:
-                connection.request("POST", path, form, HEADERS)
-                answer = connection.getresponse()
-                body = answer.read()
-                assert answer.status < 300, body
+                status, body = post_form(connection, path, form)
+                assert status < 300, body
                 answers[number] = json.loads(body)
 
     with ThreadPoolExecutor(clients, thread_name_prefix="client") as pool:
