@@ -172,7 +172,6 @@ def test_records_of_the_extractors_process_are_logged_by_the_server_with_their_t
     set_up: Set, capsys: pytest.CaptureFixture[str], log_format: str
 ) -> None:
     sent: list[bytes] = []
-    set_up()
     forward_logs(Settings(), lambda record: sent.append(pickle.dumps(record)))
     with request_id_context("r-1"):
         try:
