@@ -93,8 +93,8 @@ def map_samples(photos: DescribedPhotos) -> MapSamples:
     found = {OWN: [s for s in samples if s.left_out is None and not s.is_alone]}
     in_map = [q for q in np.flatnonzero(photos.is_query).tolist() if trial.has_place(q)]
     for name, numbers in {QUERIES: in_map, **photos.foreign}.items():
-        asked = (trial.query_sample(q, spread) for q in _thinned(numbers, most))
-        found[name] = [sample for sample in asked if sample.levels]
+        queries = (trial.query_sample(q, spread) for q in _thinned(numbers, most))
+        found[name] = [sample for sample in queries if sample.levels]
     return found
 
 
@@ -128,18 +128,18 @@ def fit_elsewhere(maps: Sequence[tuple[str, Mapping[str, FloatArray]]]) -> Coeff
     """
     intercept, *slopes = _fit_log_odds(each for _, each in maps)
     worst = (0.0, "no pair")
-    for name, asked, features in ((name, k, v) for name, each in maps for k, v in each.items()):
-        if asked == QUERIES or len(features) < MIN_PHOTOS:
+    for name, foreign, features in ((name, k, v) for name, each in maps for k, v in each.items()):
+        if foreign == QUERIES or len(features) < MIN_PHOTOS:
             continue
         held_out = _fit_log_odds(
-            {k: v for k, v in each.items() if k not in (name, asked)}
+            {k: v for k, v in each.items() if k not in (name, foreign)}
             for other, each in maps
-            if other not in (name, asked)
+            if other not in (name, foreign)
         )
         log_odds = np.sort(held_out[0] + features @ np.array(held_out[1:]))
         # As in conformal prediction, one more photo, which passes, is counted.
         least = log_odds[max(0, (len(log_odds) + 1) // 20 - 1)]
-        worst = max(worst, (float(PASSING + 0.001 - least), f"{asked} in {name}"))
+        worst = max(worst, (float(PASSING + 0.001 - least), f"{foreign} in {name}"))
     console.print(f"{worst[1]}: the intercept is raised by {worst[0]:.3f}")
     return _rounded([intercept + worst[0], *slopes])
 

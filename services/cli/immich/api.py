@@ -128,10 +128,10 @@ def _error_of(response: httpx2.Response) -> PlacewiseError:
     with contextlib.suppress(ValueError, KeyError, TypeError):
         message = json.loads(response.text)["message"]
         text = "; ".join(message) if isinstance(message, list) else str(message)
-    said = f"Immich answers {status} to {response.request.method} {response.url.path}: {text}"
+    detail = f"Immich answers {status} to {response.request.method} {response.url.path}: {text}"
     if status == 400 and text.startswith("Not found or no "):
         status = 404
-    problem = {"code": "immich_refused", "detail": f"{said}.{HINTS.get(status, '')}"}
+    problem = {"code": "immich_refused", "detail": f"{detail}.{HINTS.get(status, '')}"}
     headers = {"retry-after": response.headers.get("retry-after", "")}
     status = 503 if status in (502, 504) else status
     return response_error(httpx2.Response(status, headers=headers, json=problem))

@@ -63,13 +63,13 @@ def sync_map(
     uploads = [_upload(library, each) for each in located.values() if each.id not in current]
     report = upload_photos(client, uploads, progress, update=True)
     failed = report["refused"] + report["failed"]
-    kept = {each["path"] for each in failed}
+    failed_paths = {each["path"] for each in failed}
     gone = {_id(each) for each in stored} - located.keys()
     if gone - {photo.id for photo in photos}:  # a listing may miss what others move meanwhile
         gone -= {photo.id for photo in library.list_photos() if photo.latitude is not None}
     for each in _stored_photos(client, library):
         photo = located.get(_id(each))
-        is_replaced = photo is not None and str(Path(photo.name)) not in kept
+        is_replaced = photo is not None and str(Path(photo.name)) not in failed_paths
         if _id(each) in gone or (is_replaced and not _is_current(each, located)):
             with contextlib.suppress(NotFound):  # somebody else was faster
                 client.delete_photo(each.image_id)
