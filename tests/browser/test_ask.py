@@ -329,8 +329,8 @@ def test_the_page_shows_the_result_of_the_later_of_two_queries(
     page = visitor.visit("ask")
     held: list[Route] = []
     page.route("**/api/v1/similarity?*", lambda route: held.append(route), times=1)
-    page.locator("input[data-use=ask]").set_input_files(city.queries[0])
-    expect(page.get_by_role("heading", name="Looking for the place")).to_be_visible()
+    with page.expect_request("**/api/v1/similarity?*"):
+        page.locator("input[data-use=ask]").set_input_files(city.queries[0])
     page.locator("input[data-use=ask]").set_input_files(
         {"name": "later.jpg", "mimeType": "image/jpeg", "buffer": city.queries[1].read_bytes()}
     )
