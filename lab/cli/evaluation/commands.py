@@ -195,10 +195,10 @@ def evaluate(
     """Measure retrieval recall in a live map or on a data set.
 
     Without --data and --predictions, evaluate the map with its own photos (leave-one-out) and its
-    labelled queries. With --data, evaluate a --checkpoint, an --extractor, --rows or a --server on
-    a data set. With --predictions, evaluate a file of predictions.
+    labelled queries. With --data, evaluate a --checkpoint, an --extractor or --rows on a data set.
+    With --predictions, evaluate a file of predictions.
     """
-    map_options: OptionValues = {"--sample": sample, "--seed": seed}
+    map_options: OptionValues = {"--sample": sample, "--seed": seed, "--map": map_name}
     model_options: OptionValues = {
         "--checkpoint": checkpoint, "--extractor": extractor, "--vocabulary": vocabulary,
         "--fit-vocabulary": fit_vocabulary, "--protocol": protocol, "--rule": rule, "--rows": rows,
@@ -251,9 +251,7 @@ def evaluate(
         from lab.cli.evaluation.data_sets import EvaluationTarget, evaluate_sets
 
         size = _parse_image_size(image_size, checkpoint)
-        target = EvaluationTarget(
-            checkpoint, size, extractor, rows, vocabulary, fit_vocabulary, server, map_name, key
-        )
+        target = EvaluationTarget(checkpoint, size, extractor, rows, vocabulary, fit_vocabulary)
         if sequences:
             from lab.cli.evaluation.sequences import evaluate_sequences
 
