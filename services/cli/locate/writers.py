@@ -1,4 +1,4 @@
-"""A folder as a library, and what is written: XMP sidecars, a CSV table or GPX waypoints."""
+"""A folder as a library, and what is written: XMP sidecars or a CSV table."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from xml.etree import ElementTree
 
 from services.cli.ingest.local_headers import find_sidecars
 from services.cli.locate.folder import read_folder, read_photo
@@ -21,15 +20,13 @@ from shared.errors import PlacewiseError
 from shared.geotagging.fusion import Proposal
 from shared.ingest.photo_metadata import escape_csv_text
 
-GPX_NAMESPACE = "http://www.topografix.com/GPX/1/1"
 ERRORS_OF_ONE_FILE = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG)
-CSV_NAME, GPX_NAME = "placewise-locations.csv", "placewise-locations.gpx"
+CSV_NAME = "placewise-locations.csv"
 
 
 class Target(StrEnum):
     SIDECAR = "sidecar"
     CSV = "csv"
-    GPX = "gpx"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,22 +71,18 @@ def write_locations(folder: Path, target: Target, locations: Sequence[LocatedPho
         Conflict: `locate_in_progress`.
     """
     report = WriteReport()
-    positions = [(each, each.proposal) for each in locations if each.proposal is not None]
-    if target != Target.CSV:
-        missing = [each.photo.name for each in locations if each.proposal is None]
-        report.skipped.update(dict.fromkeys(missing, "has a place only, which --write csv writes"))
     with open_journal(folder) as journal:
-        if target != Target.SIDECAR:
-            name, content = (
-                (CSV_NAME, _to_csv(locations))
-                if target == Target.CSV
-                else (GPX_NAME, _to_gpx(positions))
-            )
-            journal.write(folder / name, content, _read(folder / name))
-            report.written.append(name)
+        if target == Target.CSV:
+            table = folder / CSV_NAME
+            journal.write(table, _to_csv(locations), _read(table))
+            report.written.append(CSV_NAME)
             return report
-        for location, proposal in positions:
+        for location in locations:
             name, photo = location.photo.name, folder / location.photo.id
+            proposal = location.proposal
+            if proposal is None:
+                report.skipped[name] = "has a place only, which --write csv writes"
+                continue
             if reason := _change_meanwhile(folder, photo):
                 report.skipped[name] = reason
                 continue
@@ -145,22 +138,3 @@ def _to_csv(locations: Sequence[LocatedPhoto]) -> bytes:
         texts = escape_csv_text(each.photo.name), escape_csv_text(each.place or "")
         writer.writerow((texts[0], *position, texts[1]))
     return text.getvalue().encode()
-
-
-def _to_gpx(positions: Sequence[tuple[LocatedPhoto, Proposal]]) -> bytes:
-    root = ElementTree.Element(
-        "gpx", {"xmlns": GPX_NAMESPACE, "version": "1.1", "creator": "Placewise"}
-    )
-    for location, proposal in positions:
-        degrees = {"lat": f"{proposal.latitude:.7f}", "lon": f"{proposal.longitude:.7f}"}
-        point = ElementTree.SubElement(root, "wpt", degrees)
-        if location.photo.time is not None and location.photo.time_zone_is_known:
-            time = location.photo.time.isoformat().replace("+00:00", "Z")
-            ElementTree.SubElement(point, "time").text = time
-        ElementTree.SubElement(point, "name").text = location.photo.name
-        ElementTree.SubElement(point, "desc").text = (
-            f"{100 * proposal.probability:.1f} % within {proposal.radius_m:.0f} m: "
-            f"{proposal.reason}"
-        )
-    ElementTree.indent(root)
-    return bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))

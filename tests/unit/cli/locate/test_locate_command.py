@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 from urllib.parse import parse_qs, urlsplit
-from xml.etree import ElementTree
 
 import pyexiv2
 import pytest
@@ -281,18 +280,13 @@ def test_control_characters_of_names_do_not_reach_the_terminal(folder: Path) -> 
     assert name in {each["filename"] for each in json.loads(as_json.stdout)["proposals"]}
 
 
-def test_a_table_can_be_indexed_and_waypoints_have_names_and_times(folder: Path) -> None:
+def test_a_table_can_be_indexed(folder: Path) -> None:
     assert run(folder, "--write", "csv").exit_code == 0
     table = folder / "placewise-locations.csv"
     entries = read_csv_manifest(table.read_bytes(), "table")
     assert [entry.name for entry in entries] == ["day 1/2.jpg"]
     assert entries[0].fields.keys() == {"latitude", "longitude"}
     assert table.read_text().startswith("filename,latitude,longitude,heading,place\n")
-    assert run(folder, "--write", "gpx").exit_code == 0
-    root = ElementTree.parse(folder / "placewise-locations.gpx").getroot()
-    point = root[0]
-    assert [child.text for child in point][:2] == ["2026-05-01T12:00:20Z", "day 1/2.jpg"]
-    assert float(point.attrib["lat"]) == pytest.approx(LATITUDE + 20 * DEGREES_PER_M, abs=1e-5)
     assert run(folder, "--undo").exit_code == 0
     assert not list(folder.glob("placewise-locations*"))
 
@@ -420,7 +414,7 @@ def test_a_map_with_labels_only_gives_places(folder: Path, server: FakeServer) -
     will_find(server, by_label, by_label)
     found = searched_proposals(server, folder)["4.jpg"]
     assert (found["place"], found["accepted"], found["position"]) == ("tower/floor 7", True, None)
-    result = searched(server, folder, "--write", "gpx")
+    result = searched(server, folder, "--write", "sidecar")
     assert (result.exit_code, "--write csv" in result.stderr) == (1, True)
     assert searched(server, folder, "--write", "csv").exit_code == 0
     assert "4.jpg,,,,tower/floor 7" in (folder / "placewise-locations.csv").read_text()
