@@ -7,7 +7,6 @@ work import torch and are imported when they are needed.
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -214,8 +213,6 @@ def evaluate(
         out, against, pairs, depth, _parse_recall_at(recall_at, depth), grids, only_wrong,
         faiss_gpu, place_labels_are_paths, as_json,
     )  # fmt: skip
-    # Must be set before torch is loaded below; see services/cli/__init__.py.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if predictions is not None:
         rules: OptionValues = {"--protocol": protocol, "--rule": rule}
         models = {name: value for name, value in model_options.items() if name not in rules}
@@ -360,8 +357,6 @@ def compare(
     Descriptors of a data set are cached in PLACEWISE_HOME/descriptors: a repeated run describes
     only what is missing. On a map of this machine, those whose weights are here are compared.
     """
-    # Must be set before torch is loaded below; see services/cli/__init__.py.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if data is None:
         from lab.cli.evaluation.compare_on_map import compare_on_map
 
