@@ -156,7 +156,7 @@ class ExtractorWorker:
         """Stop the threads and decoders; claimed jobs are requeued when their lease expires."""
         for executor in (self._describing.executor, self._publishing.executor, self._queries):
             executor.shutdown()
-        self.context.close()
+        self.context.decoders.close()
 
     def drain(self, stop: threading.Event) -> bool:
         """Process jobs until none is claimable, or `stop` is set; return whether there was one."""
