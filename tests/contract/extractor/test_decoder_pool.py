@@ -212,7 +212,7 @@ def test_process_whose_photo_nobody_waits_for_writes_to_no_other_file(
     other.write_bytes(b"rows")
     with other.open("rb") as file:
         path = f"/proc/{os.getpid()}/fd/{file.fileno()}"
-        arguments = [bytes, GOOD, path, "photo-of-before"]
+        arguments = [bytes, GOOD, 9.0, path, "photo-of-before"]
         with pytest.raises(FileNotFoundError, match="photo-of-before"):
             pool._pool.schedule(decode_into_memory, args=arguments).result()
     assert other.read_bytes() == b"rows"

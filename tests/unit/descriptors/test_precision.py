@@ -103,6 +103,27 @@ def test_half_precision_leaves_the_single_precision_network_as_it_is(
     assert torch.equal(networks["float32"].features(pixels(1)), before)
 
 
+def test_network_whose_move_to_the_device_failed_is_moved_again_and_then_left_there(
+    networks: dict[Precision, Extractor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    networks["bfloat16"].features(pixels(1))
+    made, moves = networks["float32"], iter([torch.OutOfMemoryError("GPU memory"), None])
+    before = made.features(pixels(1))
+    networks["bfloat16"].features(pixels(1))
+    vit = made.backbone._vit  # type: ignore[attr-defined]
+
+    def move(_device: torch.device) -> object:
+        if error := next(moves):
+            raise error
+        return vit
+
+    monkeypatch.setattr(vit, "to", move)
+    with pytest.raises(torch.OutOfMemoryError):
+        made.features(pixels(1))
+    assert all(torch.equal(made.features(pixels(1)), before) for _ in range(3))
+    assert next(moves, "moved twice") == "moved twice"
+
+
 def test_half_precision_converts_no_matrix_and_scales_no_branch_in_a_pass(
     networks: dict[Precision, Extractor],
 ) -> None:
