@@ -47,14 +47,13 @@ DECODE_MEMORY_BYTES = 2_000_000_000  # of one process: a JPEG of 200 megapixels 
 MAX_DECODE_ATTEMPTS = 2
 
 Decode = Callable[[bytes], DecodedPhoto]
+Photo = bytes | StoredPhoto
 
 
 class _Decoding:
     """A photo that is being decoded, and the memory to which its pixels are written."""
 
-    def __init__(
-        self, pool: ProcessPool, data: bytes | StoredPhoto, decode: Decode, seconds: float
-    ) -> None:
+    def __init__(self, pool: ProcessPool, data: Photo, decode: Decode, seconds: float) -> None:
         name = f"photo-{new_id()}"
         self._path: str | None = None
         if hasattr(os, "memfd_create"):
@@ -102,7 +101,7 @@ class DecoderPool:
 
     def decode(
         self,
-        photos: Iterable[bytes | StoredPhoto],
+        photos: Iterable[Photo],
         preprocessing: Preprocessing,
         *,
         previews: Previews = Previews.NONE,
@@ -130,7 +129,7 @@ class DecoderPool:
             for_detection=for_detection,
         )
         outcomes: list[DecodedPhoto | PlacewiseError] = []
-        pending: deque[tuple[_Decoding, bytes | StoredPhoto]] = deque()
+        pending: deque[tuple[_Decoding, Photo]] = deque()
         try:
             for data in photos:
                 if len(pending) == self._settings.decode_processes * SCHEDULED_PER_PROCESS:
@@ -160,11 +159,11 @@ class DecoderPool:
         pool.schedule(os.getpid)  # starts the processes; else the first photo would
         return pool
 
-    def _schedule(self, data: bytes | StoredPhoto, decode: Decode) -> _Decoding:
+    def _schedule(self, data: Photo, decode: Decode) -> _Decoding:
         return _Decoding(self._pool, data, decode, self._timeout_seconds)
 
     def _result(
-        self, decoding: _Decoding, data: bytes | StoredPhoto, decode: Decode
+        self, decoding: _Decoding, data: Photo, decode: Decode
     ) -> DecodedPhoto | PlacewiseError:
         for attempt in range(1, MAX_DECODE_ATTEMPTS + 1):
             try:

@@ -20,8 +20,8 @@ from PIL import Image
 
 if TYPE_CHECKING:
     from shared.imaging.decode import DecodedPhoto
-    from shared.storage import ObjectStore
 
+_open_store = functools.lru_cache(maxsize=2)(pickle.loads)  # its connections stay open
 # Memory blocks, 16 MiB at most each, that Pillow keeps for reuse between photos.
 PILLOW_CACHED_BLOCKS = 8
 
@@ -90,12 +90,6 @@ def decode_into_memory(
         for array in arrays:
             file.write(array)
     return pickled, [array.nbytes for array in arrays]
-
-
-@functools.lru_cache(maxsize=2)
-def _open_store(pickled: bytes) -> ObjectStore:
-    store: ObjectStore = pickle.loads(pickled)  # noqa: S301
-    return store
 
 
 def _store_previews(photo: StoredPhoto, decoded: DecodedPhoto) -> DecodedPhoto:

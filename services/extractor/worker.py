@@ -122,7 +122,6 @@ class ExtractorWorker:
         on_outcome = self._metrics.count_step_outcome
         self.fits = FitWorker(self.context, name, on_outcome, compute_fit, wakeups)
         self._runner = JobRunner(catalog, settings, name, DRAINED_JOBS, on_outcome, wakeups)
-        # A GPU waits for its thread; without one, queries share the processors with batches.
         niceness = BATCH_NICENESS if device == "cpu" and sys.platform == "linux" else 0
         self._describing, self._publishing = Stage("describe", niceness), Stage("publish")
         self._queries = ThreadPoolExecutor(max_workers=1, thread_name_prefix="queries")

@@ -247,8 +247,7 @@ def test_a_photo_deleted_before_it_is_read_is_not_described(averages: Harness) -
 def test_jobs_pause_while_the_object_store_is_unreachable_and_no_attempt_is_counted(
     averages: Harness, failing: str
 ) -> None:
-    folder = averages.store.root / failing
-    kept = folder.with_name("kept")
+    folder, kept = averages.store.root / failing, averages.store.root.with_name("kept")
     photo_ids = averages.upload(1, 2)
     query = averages.ask(photo_bytes(3))
     jobs = [*(averages.job_of(photo_id).id for photo_id in photo_ids), query]
@@ -259,8 +258,7 @@ def test_jobs_pause_while_the_object_store_is_unreachable_and_no_attempt_is_coun
         folder.unlink()
         kept.rename(folder)
         assert averages.ended() == (0, 0)
-        for job_id in jobs:
-            job = averages.job(job_id)
+        for job in map(averages.job, jobs):
             assert (job.state, job.attempts, job.alone) == (JobState.QUEUED, 0, False)
             assert job.run_after is not None
         assert not averages.drain()  # they pause
