@@ -11,8 +11,7 @@ are, without and with matches,
   photos do not show how weak the evidence of a right answer can be;
 - what photos of elsewhere score (`Elsewhere`). At most one in twenty photos of a set may be said to
   be in a map, also in the worst pair of both, with coefficients that were fitted without them. For
-  that, with matches all log-odds are taken nearer to even chances; without, the intercept is
-  raised, since nearer to even chances half of the photos of elsewhere in real rooms are doubtful.
+  that, all log-odds are taken nearer to even chances.
 
 With `--missing-place`, the features are standardised and the log-odds of a missing place fitted, on
 generated cities (`placewise datasets synth CITY --no-train --seed 1 ...`). Each is sampled once
@@ -58,7 +57,6 @@ from shared.matching.matchers import MutualNearest
 
 OWN, QUERIES = "own photos", "queries"
 MATCHED_PHOTOS = 45  # of each set, and twice as many of a map's own
-MATCHED_FEATURES = 3  # of "elsewhere"; without matches there are two
 MIN_PHOTOS = 20  # of a set, to say what one in twenty of it is
 EVEN = -log(ELSEWHERE_SHARE / (1 - ELSEWHERE_SHARE))  # log-odds without prior of even chances
 PASSING = EVEN + log(0.05 / 0.95)
@@ -127,7 +125,7 @@ def _thinned(numbers: Sequence[int], most: int) -> Sequence[int]:
 def fit_elsewhere(maps: Sequence[tuple[str, Mapping[str, FloatArray]]]) -> Coefficients:
     """Fit the log-odds of "elsewhere" on the (n, F) features of the photos of each set, by map.
 
-    They are moved by what the worst pair needs (see the module), which is printed.
+    They are taken as near to even chances as the worst pair needs, which is printed.
     """
     intercept, *slopes = _fit_log_odds(each for _, each in maps)
     worst = (PASSING, "no pair")
@@ -144,8 +142,6 @@ def fit_elsewhere(maps: Sequence[tuple[str, Mapping[str, FloatArray]]]) -> Coeff
         least = log_odds[max(0, (len(log_odds) + 1) // 20 - 1)]
         worst = min(worst, (float(least - 0.001), f"{foreign} in {name}"))
     console.print(f"{worst[1]}: one in twenty photos is below {worst[0]:.3f}")
-    if len(slopes) < MATCHED_FEATURES:
-        return _rounded([intercept + PASSING - worst[0], *slopes])
     nearer = (PASSING - EVEN) / (worst[0] - EVEN)
     return _rounded([EVEN + nearer * (intercept - EVEN), *(nearer * slope for slope in slopes)])
 

@@ -18,7 +18,7 @@ it is an impostor.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -47,7 +47,7 @@ from shared.evaluation.places.thresholds import (
 MIN_OWN_PHOTOS = 20
 PRIOR_PRECISION = 2.0  # of each coefficient of a standardised feature
 OWN_PRECISION = 20.0  # the same for own photos, which do not show how queries of other days differ
-ELSEWHERE_PRECISION = 0.2  # what is known of another extractor says little
+ELSEWHERE_PRECISION = 1.0  # what is known of another extractor says less
 NEWTON_STEPS = 50
 FOLDS = 5
 QUANTILES = 101  # of the scores of best photos
@@ -195,34 +195,31 @@ def _level_table(
 
 def missing_place_table(samples: Sequence[PlaceSample]) -> RegressionTable:
     """Return the samples of a missing place, half of them impostors by weight."""
+    return _impostor_table(samples, lambda levels: levels[0].features)
+
+
+def _impostor_table(
+    samples: Sequence[PlaceSample], describe: Callable[[Sequence[CandidateLevel]], FloatArray]
+) -> RegressionTable:
     samples = [s for s in samples if s.left_out is not None or not s.is_alone]
-    weights = sample_weights(samples, 0.5)
     return RegressionTable.of_rows(
-        (sample.levels[0].features, sample.left_out is not None, weight)
-        for sample, weight in zip(samples, weights, strict=True)
+        (describe(sample.levels), sample.left_out is not None, weight)
+        for sample, weight in zip(samples, sample_weights(samples, 0.5), strict=True)
     )
 
 
 def _fit_elsewhere(samples: Sequence[PlaceSample], scores: MapScores) -> Elsewhere:
     """Return the log-odds of photos of elsewhere.
 
-    Where the scores of foreign photos are not known, the map's own photos without the largest part
-    of the map that shows their place stand for them: they are more similar to the map, so that too
-    few queries are answered rather than too many.
+    Where the scores of foreign photos are not known, impostors of each kind stand for them: they
+    are more similar to the map, so that too few queries are answered rather than too many.
     """
     prior = shipped_prior()
     if scores.extractor and (known := prior.elsewhere.get(scores.extractor)):
         return known
     other = prior.elsewhere[""].model_copy(update={"background": scores.background})
-    farthest = max((s.left_out or "" for s in samples), default="")
-    own = [s for s in samples if s.left_out is None and not s.is_alone]
-    away = [s for s in samples if s.left_out == farthest and farthest]
-    table = RegressionTable.of_rows(
-        (other.features(sample.levels), sample.left_out is not None, weight)
-        for group in (own, away)
-        for sample, weight in ((each, len(own) / max(1, len(group)) / 2) for each in group)
-    )
-    if not own or not away:
+    table = _impostor_table(samples, other.features)
+    if not 0 < table.target.sum() < len(table.target):
         return other
     count = table.features.shape[1]
     plain = PlacePrior(means=(0.0,) * count, scales=(1.0,) * count, level=(), missing_place=())

@@ -33,6 +33,7 @@ from shared.evaluation.places.evidence import (
     are_matched,
     distance_between_m,
     estimate_location,
+    is_same_place,
 )
 from shared.geodesy import distances_m
 from shared.place_paths import is_within_level, label_levels
@@ -71,6 +72,8 @@ class CandidateLevel:
     """(F,) FEATURES, followed by MATCH_FEATURES if the ranking was matched"""
     best_score: float = 0.0
     """of the photo of the map that is most similar to the query"""
+    rival_score: float = 0.0
+    """mean score of that photo with those of other places that are most similar to it"""
     is_whole_map: bool = False
 
     def contains(self, location: PhotoLocation) -> bool:
@@ -135,6 +138,7 @@ def candidate_levels(
         ]
     scores, neighbour_scores = _scores(ranking), _scores(neighbours)
     shared = shared_neighbours(ranking, neighbours)
+    rival_score = _rival_score(ranking[0], neighbours, position_radius_m)
     matched, described = are_matched(ranking), []
     for level in levels:
         features = level_features(
@@ -148,8 +152,26 @@ def candidate_levels(
         if matched:
             of_matches = match_features(level, ranking[:MATCHED_PHOTOS])
             features = np.concatenate([features, of_matches])
-        described.append(replace(level, features=features, best_score=ranking[0].score))
+        described.append(
+            replace(
+                level, features=features, best_score=ranking[0].score, rival_score=rival_score
+            )
+        )
     return described
+
+
+def _rival_score(
+    best: RankedPhoto, neighbours: Sequence[RankedPhoto], position_radius_m: float
+) -> float:
+    """Return the mean score of the first neighbours that show another place than the best photo.
+
+    Without any, it is that of the last neighbour, and without neighbours the best photo's own.
+    """
+    rivals = [
+        n.score for n in neighbours if not is_same_place(best.location, n.location, position_radius_m)
+    ]
+    last = [n.score for n in neighbours[-1:]] or [best.score]
+    return float(np.mean(rivals[:VOTING_PHOTOS] or last))
 
 
 def shared_neighbours(

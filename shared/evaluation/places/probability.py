@@ -2,8 +2,8 @@
 
 A query is from elsewhere, or the map has its place. The log-odds of "elsewhere" are the prior's,
 plus a term for how similar the best photo is, in units of the scores of photos of different places
-(`Background`), and one for how far its place leads the other ranks, which show what photos of other
-places score for this query. What photos of elsewhere score was measured on foreign photos
+(`Background`), and one for how much more similar it is to the query than to photos of other places.
+What photos of elsewhere score was measured on foreign photos
 (`lab/benchmarks/place_prior.py`). Given that the map has the place, each level has a logistic
 regression on the features of the ranking (`level_features`). All probabilities come from these two
 and add up to one: a level's is that of "in this map" times its own, and a level that contains the
@@ -43,7 +43,6 @@ from shared.evaluation.places.levels import (
     FloatArray,
     LevelScheme,
     candidate_levels,
-    log_odds,
     order_by_matches,
     photos_inside,
     place_votes,
@@ -90,26 +89,25 @@ class Elsewhere(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     coefficients: Coefficients
-    """intercept, with a prior of one half; of the similarity; of the lead of the votes"""
+    """intercept, with a prior of one half; of the similarity; of its excess over rivals"""
     matched: Coefficients
     """the same with matches, and of the logarithm of the largest match support"""
     background: Background | None = None
     """unit of the similarity; None: that of the map"""
 
     def features(self, levels: Sequence[CandidateLevel]) -> FloatArray:
-        """Return the similarity of the best photo, the lead of its place, and, with matches, the
+        """Return the similarity of the best photo, how far it exceeds that of this photo with
+        other places (adaptive score normalisation; Matejka et al. 2017), and, with matches, the
         logarithm of 1 + the largest match support.
-
-        The lead is the log-odds of the votes for the place, in excess of those of its share of the
-        ranks where that is more than half: votes say nothing in a map of one place.
         """
         assert self.background is not None
-        finest = levels[0].features
-        lead = finest[0] - max(0.0, log_odds(finest[FEATURES.index("agreement")]))
-        similarity = (levels[0].best_score - self.background.mean) / self.background.deviation
-        largest = SUPPORT_UNIT * finest[len(FEATURES) :][:2].max(initial=0.0)
-        described = np.array([similarity, lead, np.log1p(largest)])
-        return described if len(finest) > len(FEATURES) else described[:2]
+        finest, unit = levels[0], self.background.deviation
+        similarity = (finest.best_score - self.background.mean) / unit
+        excess = (finest.best_score - finest.rival_score) / unit
+        of_matches = finest.features[len(FEATURES) :]
+        largest = SUPPORT_UNIT * of_matches[:2].max(initial=0.0)
+        described = np.array([similarity, excess, np.log1p(largest)])
+        return described if len(of_matches) else described[:2]
 
     def probability(self, levels: Sequence[CandidateLevel], share: float) -> float:
         """Return the probability that a query is from elsewhere, with the prior `share`."""
