@@ -162,7 +162,7 @@ def _fit_log_odds(maps: Iterable[Mapping[str, FloatArray]]) -> Coefficients:
             for is_elsewhere, features, share in rows
             for row in features
         )
-        plain = PlacePrior(means=(0.0,) * width, scales=(1.0,) * width, level=(), missing_place=())
+        plain = PlacePrior(means=(), scales=(), level=(), missing_place=())
         fitted = fit_map_estimate(table, (0.0,) * (1 + width), plain, 0.01)
         slopes = np.array(fitted[1:])
         used &= slopes <= 0

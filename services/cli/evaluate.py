@@ -113,7 +113,7 @@ def _print_evaluations(evaluations: list[Evaluation], vocabularies: dict[UUID, s
     if with_matches := used["places_with_matches"]:
         print_message(
             "With matches of local features, which "
-            + ("are used:" if used["uses_matches"] else "are not used, as they answer no more:")
+            + ("are used:" if used["uses_matches"] else "are not used, as they answer less:")
         )
         print_table(answers_table(with_matches))
     for line in _estimate_lines(used):

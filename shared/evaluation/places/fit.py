@@ -172,11 +172,7 @@ class RegressionTable:
     def of_rows(cls, rows: Iterable[tuple[FloatArray, bool, float]]) -> RegressionTable:
         """Make a table of (features, target, weight) rows."""
         columns = list(zip(*rows, strict=True)) or [(), (), ()]
-        return cls(
-            np.array(columns[0], dtype=np.float64),
-            np.array(columns[1], dtype=np.float64),
-            np.array(columns[2], dtype=np.float64),
-        )
+        return cls(*(np.array(column, dtype=np.float64) for column in columns))
 
 
 def _level_table(
@@ -221,9 +217,8 @@ def _fit_elsewhere(samples: Sequence[PlaceSample], scores: MapScores) -> Elsewhe
     table = _impostor_table(samples, other.features)
     if not 0 < table.target.sum() < len(table.target):
         return other
-    count = table.features.shape[1]
-    plain = PlacePrior(means=(0.0,) * count, scales=(1.0,) * count, level=(), missing_place=())
-    name = "coefficients" if count == 2 else "matched"
+    plain = PlacePrior(means=(), scales=(), level=(), missing_place=())
+    name = "coefficients" if table.features.shape[1] == 2 else "matched"
     fitted = fit_map_estimate(table, getattr(other, name), plain, ELSEWHERE_PRECISION)
     return other.model_copy(update={name: fitted})
 

@@ -138,7 +138,7 @@ def candidate_levels(
         ]
     scores, neighbour_scores = _scores(ranking), _scores(neighbours)
     shared = shared_neighbours(ranking, neighbours)
-    rival_score = _rival_score(ranking[0], neighbours, position_radius_m)
+    best, rival = ranking[0].score, _rival_score(ranking[0], neighbours, position_radius_m)
     matched, described = are_matched(ranking), []
     for level in levels:
         features = level_features(
@@ -152,11 +152,7 @@ def candidate_levels(
         if matched:
             of_matches = match_features(level, ranking[:MATCHED_PHOTOS])
             features = np.concatenate([features, of_matches])
-        described.append(
-            replace(
-                level, features=features, best_score=ranking[0].score, rival_score=rival_score
-            )
-        )
+        described.append(replace(level, features=features, best_score=best, rival_score=rival))
     return described
 
 
@@ -167,11 +163,9 @@ def _rival_score(
 
     Without any, it is that of the last neighbour, and without neighbours the best photo's own.
     """
-    rivals = [
-        n.score for n in neighbours if not is_same_place(best.location, n.location, position_radius_m)
-    ]
-    last = [n.score for n in neighbours[-1:]] or [best.score]
-    return float(np.mean(rivals[:VOTING_PHOTOS] or last))
+    spot = best.location
+    rivals = [n for n in neighbours if not is_same_place(spot, n.location, position_radius_m)]
+    return float(np.mean([r.score for r in rivals[:VOTING_PHOTOS] or neighbours[-1:] or [best]]))
 
 
 def shared_neighbours(
@@ -393,9 +387,5 @@ def _votes(scores: FloatArray, temperature: float) -> FloatArray:
 
 
 def _log_odds(votes: FloatArray, inside: Mask) -> float:
-    return log_odds(votes[inside].sum() / votes.sum())
-
-
-def log_odds(share: float) -> float:
-    """Return the log-odds of a share of votes or ranks, which are bounded by MIN_SHARE."""
+    share = votes[inside].sum() / votes.sum()
     return float(np.log((share + MIN_SHARE) / (1 - share + MIN_SHARE)))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.steward.map_evaluation import MIN_PHOTOS_TO_DECIDE
+from services.steward import map_evaluation
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map, Matching
 from shared.evaluation.places.probability import PlaceModel
@@ -18,6 +18,7 @@ from tests.support.local_features import add_features, scene_features
 
 PLACES = 30
 PER_PLACE = 4
+NOISE_DEGREES = 8.0
 
 
 def features_of(place: int, number: int) -> LocalFeatures:
@@ -39,13 +40,13 @@ def model(city: EvaluatedMap) -> PlaceModel:
 
 
 def test_a_map_uses_matches_where_they_answer_more(city: EvaluatedMap) -> None:
-    publish_clustered(city, noise_degrees=8.0)
+    publish_clustered(city)
     figures = city.figures()
     assert figures["uses_matches"] is True
     assert generation(city).uses_matches is True
     with_matches = model(city).with_matches
     assert with_matches is not None
-    assert with_matches.own_photos >= MIN_PHOTOS_TO_DECIDE
+    assert with_matches.own_photos >= map_evaluation.MIN_PHOTOS_TO_DECIDE
     at_95 = {a["certainty"]: a for a in figures["places_with_matches"]["answers"]}[0.95]
     without = {a["certainty"]: a for a in figures["places"]["answers"]}[0.95]
     assert at_95["answered"]["mean"] > without["answered"]["mean"] + 0.03
@@ -56,19 +57,14 @@ def test_a_map_uses_matches_where_they_answer_more(city: EvaluatedMap) -> None:
         assert by_matches["R@1"] > by_similarity["R@1"]
 
 
-def test_matches_that_tell_nothing_are_not_used(city: EvaluatedMap) -> None:
-    publish_clustered(city, noise_degrees=8.0, one_scene=True)
-    figures = city.figures()
-    assert figures["uses_matches"] is False
-    assert generation(city).uses_matches is False
-    assert model(city).with_matches is None
-
-
-@pytest.mark.parametrize(("matching", "used"), [(Matching.OFF, None), (Matching.ON, True)])
-def test_the_maps_setting_decides_before_the_evaluation(
-    city: EvaluatedMap, matching: Matching, used: bool | None
+@pytest.mark.parametrize(
+    ("matching", "used"), [(Matching.OFF, None), (Matching.ON, True), (Matching.AUTO, False)]
+)
+def test_matches_with_which_fewer_are_answered_are_used_only_if_the_map_says_so(
+    city: EvaluatedMap, monkeypatch: pytest.MonkeyPatch, matching: Matching, used: bool | None
 ) -> None:
-    publish_clustered(city, noise_degrees=8.0, one_scene=True)
+    monkeypatch.setattr(map_evaluation, "answers_less", lambda without, with_matches: True)
+    publish_clustered(city)
     set_matching(city, matching)
     city.figures()
     assert generation(city).uses_matches is used
@@ -76,27 +72,22 @@ def test_the_maps_setting_decides_before_the_evaluation(
 
 
 def test_photos_without_features_leave_it_open(city: EvaluatedMap) -> None:
-    publish_clustered(city, noise_degrees=8.0, with_features=False)
+    publish_clustered(city, with_features=False)
     figures = city.figures()
     assert (figures["uses_matches"], figures["places_with_matches"]) == (None, None)
     assert generation(city).uses_matches is None
 
 
-def publish_clustered(
-    city: EvaluatedMap, noise_degrees: float, *, one_scene: bool = False, with_features: bool = True
-) -> None:
+def publish_clustered(city: EvaluatedMap, *, with_features: bool = True) -> None:
     """Photos of places at angles that overlap, with the points of their places."""
     rng = np.random.default_rng(0)
     numbers = range(PLACES * PER_PLACE)
     seen: list[tuple[float, dict[str, Any]]] = []
     for number in numbers:
         place, walk = number // PER_PLACE, "abcd"[number % PER_PLACE]
-        angle = 360 / PLACES * place + noise_degrees * rng.normal()
+        angle = 360 / PLACES * place + NOISE_DEGREES * rng.normal()
         seen.append((angle, at(place, filename=f"{walk}{place}.jpg")))
     ids = city.publish(seen)
     if with_features:
-        scenes = {
-            photo_id: features_of(0 if one_scene else n // PER_PLACE, n)
-            for n, photo_id in enumerate(ids)
-        }
+        scenes = {photo_id: features_of(n // PER_PLACE, n) for n, photo_id in enumerate(ids)}
         add_features(city.catalog, city.store, scenes)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from services.steward.map_evaluation import answers_less
 from shared.errors import Unprocessable
 from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.evidence import PhotoLocation, RankedPhoto
@@ -561,8 +562,19 @@ def test_matches_answer_what_similar_descriptors_leave_open() -> None:
     assert len(samples[0].levels[0].features) == len(FEATURES) + len(MATCH_FEATURES)
     matched = evaluate_places(samples, [], PATHS, SCORES)
     assert answered(matched) > answered(plain) + 0.3
+    assert not answers_less(plain, matched)
     assert matched.figures is not None
     assert matched.figures["answers"][2]["precision"]["mean"] >= 0.95
+
+
+def test_a_map_whose_photos_do_not_match_each_other_is_answered_less_with_matches() -> None:
+    own = sampler(places=40, per_place=5, noise=0.2)
+    known = replace(SCORES, extractor="efficientnet-lite0-vlad128")
+    plain, matched = (
+        evaluate_places(list(own.samples(range(200), 0.5, match)), [], PATHS, known)
+        for match in (None, lambda _, others: [4.0] * len(others))
+    )
+    assert answers_less(plain, matched)
 
 
 def test_samples_whose_first_photos_were_not_all_compared_have_no_matches() -> None:
