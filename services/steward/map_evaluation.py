@@ -171,7 +171,7 @@ class MapEvaluationResult:
     figures: dict[str, Any]
     model: PlaceModel
     uses_matches: bool | None
-    """Whether matches help the map; None if too few photos could be matched."""
+    """Whether estimates use matches; None if too few photos could be matched."""
 
 
 def answers_less(without: PlaceEvaluation, with_matches: PlaceEvaluation) -> bool:

@@ -149,7 +149,7 @@ class RankingParams(BaseModel):
         ge=0,
         le=MAX_MATCHED_PHOTOS,
         description="Match the local features of the first N photos with the query's. Default: 10 "
-        "if matches improve the answers of the map, and with `explain`; 0 otherwise.",
+        "if estimates of the map use matches, and with `explain`; 0 otherwise.",
     )
     rerank: int | None = Field(
         None,
