@@ -23,18 +23,14 @@ from services.search.catalog_sync import (
     SYNCED_STATES,
     ReplicationLagTracker,
     read_generation_versions,
-    sync_snapshot,
 )
-from services.search.chunk_loader import list_generation_folders, remove_stale_folders
-from services.search.executor import SearchOptions, execute_query
-from services.search.photo_columns import build_row_mask
+from services.search.memory_index import MemoryIndex
 from services.search.photo_matcher import PhotoMatcher
 from services.search.pose_estimator import PoseEstimator
 from services.search.query_batcher import QueryBatcher
-from services.search.residency import MemoryBudget
-from services.search.snapshot import Snapshot
+from services.search.row_index import IndexSnapshot, RowIndex
 from shared.catalog.database.errors import OutageLog
-from shared.catalog.database.session import Catalog, ChangePoll
+from shared.catalog.database.session import IDLE_SECONDS, Catalog, ChangePoll
 from shared.catalog.generations import GenerationState
 from shared.config.settings import Settings
 from shared.config.shards import SINGLE_SHARD, Shard
@@ -70,25 +66,25 @@ class QueryRowReader:
             CACHED_ROW_BYTES, getsizeof=lambda row: row.nbytes
         )
 
-    def read_query(self, snapshot: Snapshot, request: SearchRequest) -> Row:
+    def read_query(self, snapshot: IndexSnapshot, request: SearchRequest) -> Row:
         """Return the (dimension,) row that a request refers to.
 
         Raises:
             Gone: `query_expired` if the row no longer exists.
             Unavailable: `chunk_unreadable` if the row's object is damaged.
         """
-        chunk = snapshot.by_key.get(request.object_key)
-        if request.object_key in snapshot.missing and not snapshot.disk_full:
+        if request.object_key in snapshot.unreadable:
             raise _unreadable_error(request.object_key)
-        if chunk is None:
-            reference = RowReference(object_key=request.object_key, row=request.row)
-            if request.object_key.startswith(QUERIES):  # expires with its object
-                return self._read(reference)
-            return self._read_cached(reference)
-        if request.row >= len(chunk.rows):
-            raise _reference_expired_error(f"row {request.row} of {request.object_key}")
-        row: Row = chunk.rows[request.row].astype(np.float32)
-        return row
+        try:
+            row = snapshot.read_row(request.object_key, request.row)
+        except IndexError:
+            raise _reference_expired_error(f"row {request.row} of {request.object_key}") from None
+        if row is not None:
+            return row
+        reference = RowReference(object_key=request.object_key, row=request.row)
+        if request.object_key.startswith(QUERIES):  # expires with its object
+            return self._read(reference)
+        return self._read_cached(reference)
 
     def read_background(self, references: Sequence[RowReference]) -> list[Row]:
         """Return the rows of a background that still exist.
@@ -152,7 +148,6 @@ MAX_WAIT_SECONDS = 5.0  # for `min_version`; half of the time that the gateway g
 FOLLOW_SECONDS = 1.0  # interval of the polls for changes of the catalog
 VERSION_POLL_SECONDS = 0.01
 LOAD_THREADS = 4  # one may take minutes for a generation that is being built
-FILE_CHECK_SECONDS = 5.0  # interval of the checks whether mapped files were changed
 
 
 class SearchWorker:
@@ -178,18 +173,24 @@ class SearchWorker:
         self._catalog = catalog
         self._max_wait_seconds = max_wait_seconds
         self._store = store
-        self._folder = settings.search_cache_folder(shard)
         self.query_batcher = QueryBatcher()
-        self._memory_budget = MemoryBudget(settings.search_memory_bytes)
+        self._unreadable = ReadRetries()
+        self._index: RowIndex
+        if settings.search_engine == "milvus":
+            from services.search.milvus.index import MilvusIndex  # needs the extra milvus
+
+            self._index = MilvusIndex(catalog, store, settings, self._unreadable)
+        else:
+            self._index = MemoryIndex(
+                catalog, store, settings, self._unreadable, self.query_batcher, shard
+            )
         self._query_rows = QueryRowReader(store)
         self._photo_matcher = PhotoMatcher(store)
         self._pose_estimator = PoseEstimator(store, self._photo_matcher)
-        self._snapshots: dict[UUID, Snapshot] = {}
+        self._snapshots: dict[UUID, IndexSnapshot] = {}
         self._lock = threading.Lock()  # of snapshots and loads; never held during I/O
-        self._loads: dict[UUID, futures.Future[Snapshot | None]] = {}  # running, of each generation
+        self._loads: dict[UUID, futures.Future[IndexSnapshot | None]] = {}  # running
         self._load_threads = futures.ThreadPoolExecutor(LOAD_THREADS, "search-load")
-        self._unreadable = ReadRetries()
-        self._files_due: dict[UUID, float] = {}  # next check of each generation's files
 
     def run(self, stop: threading.Event) -> None:
         """Sync active generations until `stop` is set."""
@@ -215,13 +216,14 @@ class SearchWorker:
                 outage.record_error(error)
             except (OSError, Unavailable) as error:
                 log.error("sync failed, loaded snapshots go on serving queries: %s", error)
-            poll.wait(stop, FOLLOW_SECONDS)
+            idle_seconds = FOLLOW_SECONDS if self._index.changes_alone else IDLE_SECONDS
+            poll.wait(stop, FOLLOW_SECONDS, idle_seconds)
 
     def sync(self, states: Collection[GenerationState] = SYNCED_STATES) -> None:
         """Sync every generation of these states to its map's version; drop deleted generations."""
         read_at = time.monotonic()
         # Before the catalog is read: what another thread loads meanwhile has not ended.
-        held, folders = self._snapshots.keys(), list_generation_folders(self._folder)
+        searched, held = self._snapshots.keys(), self._index.list_held()
         current = read_generation_versions(self._catalog)
         self.replication_lag.record_catalog_read(current, read_at)
         for generation_id, target in current.items():
@@ -231,18 +233,15 @@ class SearchWorker:
             if (
                 snapshot is None
                 or snapshot.version < target.version
-                or self._needs_reload(snapshot)
+                or self._index.needs_sync(snapshot)
             ):
                 self._load(generation_id, target.version)
             self.replication_lag.record_synced(generation_id, read_at)
-        ended = held - current.keys()
-        for generation_id in ended:
-            self._memory_budget.release_generation(generation_id)
+        ended = searched - current.keys()
         with self._lock:
             self._snapshots = {k: v for k, v in self._snapshots.items() if k not in ended}
             known = {*current, *self._snapshots, *self._loads}
-            self._files_due = {k: v for k, v in self._files_due.items() if k in known}
-        remove_stale_folders(folders, known)
+        self._index.remove_others(held, known)
         self._unreadable.forget_others(
             {key for snapshot in self._snapshots.values() for key in snapshot.missing}
         )
@@ -254,9 +253,7 @@ class SearchWorker:
         if request.background:
             background = self._query_rows.read_background(request.background)
             query = subtract_background(query, background)
-        row_mask = build_row_mask(snapshot.photos, request.photos, request.exclude)
-        options = SearchOptions(request.k, request.mode)
-        return execute_query(snapshot, query, row_mask, options, self.query_batcher)
+        return self._index.search(snapshot, query, request)
 
     def match(self, request: MatchRequest) -> MatchResponse:
         """Match local features, of photos of any shard; see `MatchRequest`."""
@@ -282,9 +279,10 @@ class SearchWorker:
             missing=tuple(key for snapshot in snapshots.values() for key in snapshot.missing),
             disk_full=any(snapshot.disk_full for snapshot in snapshots.values()),
             lags=self.replication_lag.current_lags(versions),
+            recalls=dict(self._index.recalls),
         )
 
-    def snapshot(self, generation_id: UUID, min_version: int) -> Snapshot:
+    def snapshot(self, generation_id: UUID, min_version: int) -> IndexSnapshot:
         """Return a snapshot at least as new as `min_version`.
 
         Raises:
@@ -300,7 +298,7 @@ class SearchWorker:
 
     def _load(
         self, generation_id: UUID, version: int, max_wait_seconds: float = threading.TIMEOUT_MAX
-    ) -> Snapshot | None:
+    ) -> IndexSnapshot | None:
         """Wait for a thread to load this version of a generation, or a later one.
 
         All who wait for a generation wait for the same thread. Returns None if the generation no
@@ -323,33 +321,14 @@ class SearchWorker:
             f"Search has not caught up with version {version} of the map. Retry in a moment.",
         )
 
-    def _load_snapshot(self, generation_id: UUID) -> Snapshot | None:
+    def _load_snapshot(self, generation_id: UUID) -> IndexSnapshot | None:
         """Load a generation in a thread of its own, and serve the new snapshot."""
         new = None
         try:
-            new = sync_snapshot(
-                self._catalog,
-                self._store,
-                self._folder,
-                self._memory_budget,
-                generation_id,
-                self._snapshots.get(generation_id),
-                self._unreadable,
-                self.shard,
-            )
+            new = self._index.sync(generation_id, self._snapshots.get(generation_id))
             return new
         finally:
             with self._lock:
                 if new is not None:
                     self._snapshots = {**self._snapshots, generation_id: new}
                 del self._loads[generation_id]
-
-    def _needs_reload(self, snapshot: Snapshot) -> bool:
-        """Whether a missing chunk is due for a retry, or a mapped file was changed."""
-        if self._unreadable.any_due(snapshot.missing):
-            return True
-        now = time.monotonic()
-        if now < self._files_due.get(snapshot.generation_id, 0.0):
-            return False
-        self._files_due[snapshot.generation_id] = now + FILE_CHECK_SECONDS
-        return any(chunk.was_changed() for chunk in snapshot.chunks)

@@ -227,6 +227,16 @@ def estimate_described(session: Session, generation_id: UUID) -> int:
     return count_rows(session, _select_described(generation_id))
 
 
+def list_described(session: Session, generation_id: UUID) -> set[UUID]:
+    """Return the live photos with a descriptor in the generation."""
+    return set(session.scalars(_select_described(generation_id)))
+
+
+def count_described(session: Session, generation_id: UUID) -> int:
+    """Count the live photos with a descriptor in the generation."""
+    return count_rows(session, _select_described(generation_id))
+
+
 def count_searchable(session: Session, generation_id: UUID) -> int:
     """Count the photos that searches of the generation can return."""
     return count_rows(session, _select_described(generation_id, PhotoRole.DATABASE))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import re
+from typing import Literal, Self
 
-from pydantic import Field, field_validator
+from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings
 
 from shared.config.shards import Shard
@@ -31,6 +32,23 @@ class SearchSettings(BaseSettings):
         ge=0,
         description="bytes of codes and rows that search keeps in memory; unset: half of the "
         "machine's memory, or of the container's memory limit",
+    )
+
+    search_engine: Literal["placewise", "milvus"] = Field(
+        "placewise",
+        description="what search workers find rows with: their own memory, or Milvus, for maps "
+        "larger than one machine (needs the extra milvus)",
+    )
+    milvus_uri: SecretStr | None = Field(
+        None,
+        description="URL of Milvus, with a user or a token if it needs one: "
+        "https://user:password@milvus:19530, https://:token@milvus:19530; a file name that ends "
+        "in .db is opened with milvus-lite",
+    )
+    milvus_index: Literal["FLAT", "HNSW", "IVF_FLAT"] = Field(
+        "FLAT",
+        description="index of new collections in Milvus: FLAT compares every row, the others are "
+        "approximate",
     )
 
     # Search workers on several machines (`placewise search`, which listens on HOST and PORT).
@@ -69,6 +87,25 @@ class SearchSettings(BaseSettings):
                     "commas"
                 )
         return value
+
+    @field_validator("milvus_uri")
+    @classmethod
+    def _check_milvus(cls, value: SecretStr | None) -> SecretStr | None:
+        uri = value.get_secret_value() if value else "x.db"
+        if not uri.endswith(".db") and not re.fullmatch(r"https?://[^\s/?#]+/?", uri):
+            raise ValueError("MILVUS_URI is not a URL such as http://milvus:19530")
+        return value
+
+    @model_validator(mode="after")
+    def _check_engine(self) -> Self:
+        if self.search_engine == "milvus" and self.milvus_uri is None:
+            raise ValueError("SEARCH_ENGINE=milvus needs MILVUS_URI, such as http://milvus:19530")
+        return self
+
+    @property
+    def milvus_address(self) -> str:
+        """MILVUS_URI as text, with what is secret in it."""
+        return self.milvus_uri.get_secret_value() if self.milvus_uri else ""
 
     @property
     def level_radii_m(self) -> tuple[float, ...]:

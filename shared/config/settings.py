@@ -29,7 +29,14 @@ from shared.config.storage_settings import StorageSettings
 from shared.errors import Misconfigured
 
 # Each may be given as NAME_FILE, too: the path of a file with the value, such as a mounted secret.
-SECRET_SETTINGS = ("ADMIN_KEY", "DATABASE_URL", "REDIS_URL", "S3_ACCESS_KEY", "S3_SECRET_KEY")
+SECRET_SETTINGS = (
+    "ADMIN_KEY",
+    "DATABASE_URL",
+    "MILVUS_URI",
+    "REDIS_URL",
+    "S3_ACCESS_KEY",
+    "S3_SECRET_KEY",
+)
 
 GPU_BATCH_PHOTOS = 64  # more at once are hardly faster: docs/how-to/throughput.md
 CGROUP_MEMORY_LIMIT_FILE = Path("/sys/fs/cgroup/memory.max")

@@ -21,9 +21,12 @@ from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
 
 EXHAUSTIVE = "exhaustive"  # every row was compared exactly
 STATISTICAL = "statistical"  # no other row can be among them, but with odds of about 1 in 10^8
+APPROXIMATE = (
+    "approximate"  # an approximate index chose the rows, or the engine's limit was reached
+)
 NONE = "none"  # a part of the map is missing: better rows may exist
 
-CERTIFICATES = (EXHAUSTIVE, STATISTICAL, NONE)
+CERTIFICATES = (EXHAUSTIVE, STATISTICAL, APPROXIMATE, NONE)
 """Guarantees of a result's completeness, strongest first."""
 
 
@@ -149,6 +152,8 @@ class SearchStatus(_Message):
     """Whether some are unreadable only because a worker's cache is on a full disk."""
     lags: dict[UUID, ReplicationLag] = {}
     """Replication lag by generation; empty for a worker that does not follow the catalog."""
+    recalls: dict[UUID, float] = {}
+    """Measured recall of the generations that are searched by an approximate index"""
     unavailable: tuple[str, ...] = ()
     """Shards without an answering worker, as `SearchResponse.missing` names them."""
 
