@@ -16,7 +16,6 @@ from services.search.residency import MemoryBudget
 from services.search.snapshot import Snapshot
 from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
-from shared.config.shards import Shard
 from shared.search_api.protocol import SearchRequest, SearchResponse
 from shared.storage import ObjectStore
 from shared.storage.chunks import Row
@@ -38,12 +37,10 @@ class MemoryIndex:
         settings: Settings,
         unreadable: ReadRetries,
         batcher: QueryBatcher,
-        shard: Shard,
     ) -> None:
-        self._shard = shard
         self._catalog = catalog
         self._store = store
-        self._folder = settings.search_cache_folder(shard)
+        self._folder = settings.search_cache_folder
         self._batcher = batcher
         self._memory_budget = MemoryBudget(settings.search_memory_bytes)
         self._unreadable = unreadable
@@ -59,7 +56,6 @@ class MemoryIndex:
             generation_id,
             old,
             self._unreadable,
-            self._shard,
         )
 
     def needs_sync(self, snapshot: Snapshot) -> bool:

@@ -27,7 +27,7 @@ from shared.search_api.protocol import (
 from shared.telemetry.tracing import span
 
 METRIC_PREFIX = "placewise_search"
-# Seconds, from a small map in memory to a dense scan of a full shard, and the longest wait for a
+# Seconds, from a small map in memory to a dense scan of a full worker, and the longest wait for a
 # version.
 LATENCY_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 
@@ -91,7 +91,7 @@ class MeteredSearch:
         """Search and record the metrics of the response."""
         with (
             _measured(self._searches, self._seconds),
-            span("search", shard=str(self._worker.shard), k=request.k),
+            span("search", k=request.k),
         ):
             response = self._worker.search(request)
         self._rows.inc(response.rows_scanned)
@@ -156,7 +156,7 @@ class _SnapshotCollector(Collector):
             ("resident_bytes", "Bytes of descriptors in memory.", status.resident_bytes),
             ("mapped_bytes", "Bytes of descriptors on disk.", status.mapped_bytes),
             ("rows", "Searchable rows.", status.rows),
-            ("missing_chunks", "Unreadable chunks.", len(status.missing)),
+            ("missing_chunks", "Unreadable or unwritten chunks.", len(status.missing)),
         ):
             yield GaugeMetricFamily(f"{METRIC_PREFIX}_{name}", text, value)
         scans = "First-level scans of the sign codes."
@@ -167,6 +167,7 @@ class _SnapshotCollector(Collector):
         )
         lags = status.lags.items()
         of_generations: tuple[tuple[str, str, Mapping[UUID, float]], ...] = (
+            ("recall", "Measured recall of an approximate index.", status.recalls),
             ("version", "Version of the map in the snapshot.", status.versions),
             (
                 "lag_versions",

@@ -59,7 +59,6 @@ class Readiness(BaseModel):
     """
 
     status: str
-    shard: str
     reasons: list[str]
     lags: dict[UUID, ReplicationLag]
     missing: list[str]
@@ -69,8 +68,7 @@ def create_search_app(worker: SearchWorker, registry: CollectorRegistry | None =
     """Create the HTTP API of a worker, which the caller keeps in sync with the catalog."""
     app = FastAPI(
         title="Placewise search",
-        description=f"Exact cosine top-k on shard {worker.shard} of every map, matches of local "
-        "features, and poses.",
+        description="Cosine top-k on every map, matches of local features, and poses.",
         responses=PROBLEM_RESPONSES,
     )
     install_exception_handlers(app)
@@ -79,13 +77,13 @@ def create_search_app(worker: SearchWorker, registry: CollectorRegistry | None =
 
     @app.post("/search", operation_id="search", response_model=SearchResponse)
     def search(request: SearchRequest) -> Response:
-        """Search this shard for the rows that are most similar to the referenced one."""
+        """Search for the rows that are most similar to the referenced one."""
         # Serialised here, because FastAPI would validate the response again.
         return Response(metrics.search(request).model_dump_json(), media_type="application/json")
 
     @app.post("/match", operation_id="match", response_model=MatchResponse)
     def match(request: MatchRequest) -> Response:
-        """Match the local features of a query with those of photos of any shard."""
+        """Match the local features of a query with those of photos."""
         return Response(metrics.match(request).model_dump_json(), media_type="application/json")
 
     @app.post("/pose", operation_id="estimate_pose", response_model=PoseResponse)
@@ -140,7 +138,6 @@ def _check_readiness(worker: SearchWorker) -> Readiness:
             )
     return Readiness(
         status="not ready" if reasons else "degraded" if status.missing else "ready",
-        shard=status.shard,
         reasons=reasons,
         lags=status.lags,
         missing=list(status.missing),
@@ -187,18 +184,16 @@ class WorkerHeartbeat:
     def send_if_due(self) -> None:
         """Write the entry if the loaded versions have changed, or a heartbeat is due."""
         status = self._worker.status()
-        versions = status.loaded, status.missing
+        versions = status.loaded, status.unreadable
         if versions == self._sent_versions and time.monotonic() - self._sent_at < HEARTBEAT_SECONDS:
             return
         with self._catalog.write(is_heartbeat=versions == self._sent_versions) as session:
-            upsert_search_worker(
-                session, self.id, self._name, self._url, self._worker.shard, *versions
-            )
+            upsert_search_worker(session, self.id, self._name, self._url, *versions)
         self._sent_versions, self._sent_at = versions, time.monotonic()
 
 
 def serve_search(settings: Settings, announce: Announce) -> None:
-    """Serve searches in the shard SEARCH_SHARD on HOST and PORT until SIGTERM.
+    """Serve searches on HOST and PORT until SIGTERM.
 
     Raises:
         Misconfigured: `address_in_use`; also as `service_process` raises it.
@@ -209,7 +204,7 @@ def serve_search(settings: Settings, announce: Announce) -> None:
         with listen(settings.host, settings.port) as listener:
             host, port = listener.getsockname()[:2]
             registry = CollectorRegistry()
-            worker = SearchWorker(catalog, store, settings, settings.shard)
+            worker = SearchWorker(catalog, store, settings)
             url = reachable_url(host, port)
             heartbeat = WorkerHeartbeat(catalog, worker, f"{socket.gethostname()}:{port}", url)
             # Its clients are a few gateways, with one connection for each concurrent query.
@@ -226,7 +221,7 @@ def serve_search(settings: Settings, announce: Announce) -> None:
             try:
                 with serve_metrics(settings, registry), stop_on_signals(server):
                     announce(
-                        f"Placewise search serves shard {settings.shard} on {url}\n"
+                        f"Placewise search listens on {url}\n"
                         f"  health:   {url}/readyz   {url}/metrics"
                     )
                     server.run(sockets=[listener])

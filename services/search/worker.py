@@ -1,8 +1,8 @@
 """Search worker: `SearchBackend` in process, on snapshots that are swapped atomically.
 
 `SearchWorker` keeps a snapshot of each generation in sync with the catalog and runs queries on the
-current one. `QueryRowReader` reads the row that a query refers to, which may lie in a chunk of
-another shard, in a chunk that has been merged since, or under `queries/`. It caches stored rows:
+current one. `QueryRowReader` reads the row that a query refers to, which may lie in a chunk
+that has been merged since, or under `queries/`. It caches stored rows:
 the gateway asks for more hits of the same query, and evaluations use the same photos again.
 """
 
@@ -33,7 +33,6 @@ from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.session import IDLE_SECONDS, Catalog, ChangePoll
 from shared.catalog.generations import GenerationState
 from shared.config.settings import Settings
-from shared.config.shards import SINGLE_SHARD, Shard
 from shared.errors import Gone, NotFound, Unavailable
 from shared.search_api.background import subtract_background
 from shared.search_api.protocol import (
@@ -144,14 +143,14 @@ def _unreadable_error(object_key: str) -> Unavailable:
     )
 
 
-MAX_WAIT_SECONDS = 5.0  # for `min_version`; half of the time that the gateway gives a shard
+MAX_WAIT_SECONDS = 5.0  # for `min_version`; half of the time that the gateway gives a search
 FOLLOW_SECONDS = 1.0  # interval of the polls for changes of the catalog
 VERSION_POLL_SECONDS = 0.01
 LOAD_THREADS = 4  # one may take minutes for a generation that is being built
 
 
 class SearchWorker:
-    """Holds one snapshot of its shard for each generation; `search` is thread-safe.
+    """Holds one snapshot of each generation; `search` is thread-safe.
 
     A query uses the current snapshot. Only if that is older than `min_version` does it wait, at
     most `max_wait_seconds`, for the thread that loads the newer one. Loading one generation never
@@ -163,12 +162,10 @@ class SearchWorker:
         catalog: Catalog,
         store: ObjectStore,
         settings: Settings,
-        shard: Shard = SINGLE_SHARD,
         *,
         max_wait_seconds: float = MAX_WAIT_SECONDS,
     ) -> None:
         """Create a worker without any snapshot."""
-        self.shard = shard
         self.replication_lag = ReplicationLagTracker()
         self._catalog = catalog
         self._max_wait_seconds = max_wait_seconds
@@ -182,7 +179,7 @@ class SearchWorker:
             self._index = MilvusIndex(catalog, store, settings, self._unreadable)
         else:
             self._index = MemoryIndex(
-                catalog, store, settings, self._unreadable, self.query_batcher, shard
+                catalog, store, settings, self._unreadable, self.query_batcher
             )
         self._query_rows = QueryRowReader(store)
         self._photo_matcher = PhotoMatcher(store)
@@ -247,7 +244,7 @@ class SearchWorker:
         )
 
     def search(self, request: SearchRequest) -> SearchResponse:
-        """Return the most similar rows of this shard; see `SearchRequest`."""
+        """Return the most similar rows; see `SearchRequest`."""
         snapshot = self.snapshot(request.generation_id, request.min_version)
         query = self._query_rows.read_query(snapshot, request)
         if request.background:
@@ -256,11 +253,11 @@ class SearchWorker:
         return self._index.search(snapshot, query, request)
 
     def match(self, request: MatchRequest) -> MatchResponse:
-        """Match local features, of photos of any shard; see `MatchRequest`."""
+        """Match local features; see `MatchRequest`."""
         return self._photo_matcher.match(request)
 
     def estimate_pose(self, request: PoseRequest) -> PoseResponse:
-        """Compute a pose, with photos of any shard; see `PoseRequest`."""
+        """Compute a pose; see `PoseRequest`."""
         return self._pose_estimator.estimate(request)
 
     def status(self) -> SearchStatus:
@@ -269,7 +266,6 @@ class SearchWorker:
         versions = {key: snapshot.version for key, snapshot in snapshots.items()}
         parts = [part for snapshot in snapshots.values() for part in snapshot.parts]
         return SearchStatus(
-            shard=str(self.shard),
             rows=sum(snapshot.live_rows for snapshot in snapshots.values()),
             resident_bytes=sum(part.size_bytes for part in parts if part.resident),
             mapped_bytes=sum(part.size_bytes for part in parts if not part.resident),
@@ -277,6 +273,7 @@ class SearchWorker:
             versions=versions,
             incomplete=tuple(key for key, snapshot in snapshots.items() if snapshot.missing),
             missing=tuple(key for snapshot in snapshots.values() for key in snapshot.missing),
+            unreadable=tuple(key for each in snapshots.values() for key in each.unreadable),
             disk_full=any(snapshot.disk_full for snapshot in snapshots.values()),
             lags=self.replication_lag.current_lags(versions),
             recalls=dict(self._index.recalls),

@@ -3,7 +3,7 @@
 The registry of gateways, extractors and stewards is informational, for `GET /health` and operators;
 leases decide which worker owns a job.
 
-Search workers have a registry of their own with their shard and the versions that they have
+Search workers have a registry of their own with the versions that they have
 loaded, updated about every second or two. A generation is activated only once every live worker has
 registered it as loaded.
 """
@@ -23,7 +23,7 @@ from importlib.metadata import version
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import Integer, String, Text, Uuid, and_, delete, or_, select, update
+from sqlalchemy import String, Text, Uuid, and_, delete, or_, select, update
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
@@ -38,7 +38,6 @@ from shared.catalog.database.base import (
 )
 from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.session import Catalog
-from shared.config.shards import Shard
 from shared.ids import new_id
 
 log = logging.getLogger(__name__)
@@ -192,8 +191,6 @@ class RegisteredSearchWorker(Base):
     id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     name: Mapped[str] = mapped_column(String(200))
     url: Mapped[str | None] = mapped_column(Text)
-    shard: Mapped[int] = mapped_column(Integer)
-    shards: Mapped[int] = mapped_column(Integer)
     loaded: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
     started_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     seen_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
@@ -208,7 +205,6 @@ def upsert_search_worker(
     worker_id: UUID,
     name: str,
     url: str | None,
-    shard: Shard,
     loaded: Mapping[UUID, int],
     unreadable: Sequence[str] = (),
 ) -> None:
@@ -228,8 +224,6 @@ def upsert_search_worker(
                 id=worker_id,
                 name=name,
                 url=url,
-                shard=shard.index,
-                shards=shard.of,
                 loaded=versions,
             )
         )
@@ -265,21 +259,17 @@ def list_lagging_workers(
 ) -> list[RegisteredSearchWorker]:
     """List the live workers that have not loaded the generation at `version` yet, by name.
 
-    Workers whose shards have no chunk of the generation are left out.
+    None lags behind a generation without chunks.
     """
-    slots = session.scalars(
-        select(Chunk.slot)
-        .where(Chunk.generation_id == generation_id, Chunk.superseded_at.is_(None))
-        .distinct()
-    ).all()
+    chunks = select(Chunk.id).where(
+        Chunk.generation_id == generation_id, Chunk.superseded_at.is_(None)
+    )
     live = session.scalars(
         select(RegisteredSearchWorker)
-        .where(RegisteredSearchWorker.seen_at >= db_now_plus(-SEARCH_WORKER_TIMEOUT_SECONDS))
+        .where(
+            RegisteredSearchWorker.seen_at >= db_now_plus(-SEARCH_WORKER_TIMEOUT_SECONDS),
+            chunks.exists(),
+        )
         .order_by(RegisteredSearchWorker.name, RegisteredSearchWorker.id)
     )
-    return [
-        worker
-        for worker in live
-        if any(Shard(worker.shard, worker.shards).owns(slot) for slot in slots)
-        and not worker.has(generation_id, version)
-    ]
+    return [worker for worker in live if not worker.has(generation_id, version)]

@@ -1,4 +1,4 @@
-"""Settings of search: catalog sync, memory budget, shards, ranking, location estimates."""
+"""Settings of search: catalog sync, memory budget, engine, ranking, location estimates."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from typing import Literal, Self
 from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings
 
-from shared.config.shards import Shard
 from shared.config.values import Size, split_list
 
 
 class SearchSettings(BaseSettings):
-    """How search workers follow the catalog, share the rows among them and rank results."""
+    """What search workers find rows with, and how they rank results."""
 
     estimate_radii_m: str = Field(
         "25,100,500,2000",
@@ -52,9 +51,6 @@ class SearchSettings(BaseSettings):
     )
 
     # Search workers on several machines (`placewise search`, which listens on HOST and PORT).
-    search_shard: str = Field(
-        "0/1", description="shard of this search worker: 1/3 is the second of three shards"
-    )
     search_urls: str | None = Field(
         None,
         description="URLs of all search workers, separated by commas; unset: search runs in this "
@@ -71,11 +67,6 @@ class SearchSettings(BaseSettings):
         if not radii or not all(0 < radius < math.inf for radius in radii):
             raise ValueError(f"{value!r} is not a list of radii in metres, such as 25,100,500")
         return value
-
-    @field_validator("search_shard")
-    @classmethod
-    def _check_shard(cls, value: str) -> str:
-        return str(Shard.parse(value))
 
     @field_validator("search_urls")
     @classmethod
@@ -116,11 +107,6 @@ class SearchSettings(BaseSettings):
     def estimate_radius_m(self) -> float:
         """Distance to the true position within which an estimate counts as correct, in metres."""
         return self.level_radii_m[0]
-
-    @property
-    def shard(self) -> Shard:
-        """The shard that this process's search worker holds."""
-        return Shard.parse(self.search_shard)
 
     @property
     def search_worker_urls(self) -> tuple[str, ...]:

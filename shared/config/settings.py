@@ -24,7 +24,6 @@ from pydantic_settings import (
 from shared.config.extractor_settings import MAX_DECODE_PROCESSES, ExtractorSettings
 from shared.config.gateway_settings import GatewaySettings
 from shared.config.search_settings import SearchSettings
-from shared.config.shards import Shard
 from shared.config.storage_settings import StorageSettings
 from shared.errors import Misconfigured
 
@@ -203,9 +202,10 @@ class Settings(
         unset = chosen.keys() - self.model_fields_set
         return self.model_copy(update={name: chosen[name] for name in unset})
 
-    def search_cache_folder(self, shard: Shard) -> Path:
-        """The folder where the search worker of a shard caches objects of a bucket."""
-        return self.placewise_home / "search-cache" / str(shard).replace("/", "-of-")
+    @property
+    def search_cache_folder(self) -> Path:
+        """The folder where search workers cache objects of a bucket."""
+        return self.placewise_home / "search-cache"
 
     @property
     def search_memory_bytes(self) -> int:

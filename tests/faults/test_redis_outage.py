@@ -46,7 +46,6 @@ def fleet() -> Iterator[Fleet]:
     with open_fleet(
         gateways=1,
         extractors=2,
-        shards=1,
         executed=False,
         extractor="test-slow-avg:milliseconds=5,width=256",
         lease_seconds=5.0,

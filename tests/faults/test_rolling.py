@@ -20,7 +20,7 @@ from shared.catalog.chunks import Descriptor
 from tests.support.photos import photo_bytes
 from tests.support.server import SERVICES_KEY
 
-ONE_OF_EACH = ("gateway-0", "extractor-0", "search-0-0", "steward-0")
+ONE_OF_EACH = ("gateway-0", "extractor-0", "search-0", "steward-0")
 FIRST_PHOTOS = 12
 PAUSE_SECONDS = 0.1  # between a client's requests, so that the CPU is not saturated
 SECONDS = 120.0

@@ -154,7 +154,7 @@ def livez() -> ProbeResponse:
 def readyz(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> ProbeResponse:
     """Readiness probe: 503 while a component that every request needs is unavailable.
 
-    Degraded components are ready: the other shards and chunks can be searched, and photos can be
+    Degraded components are ready: the other chunks can be searched, and photos can be
     deleted while the disk is full.
     """
     components = _check_components(gateway, admission)
@@ -173,7 +173,7 @@ def readyz(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> 
 def read_health(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> HealthResponse:
     """Get the health of each component; 503 unless all are healthy.
 
-    `degraded`: chunks or shards can't be searched, photos can't be described, uploads are refused
+    `degraded`: chunks can't be searched, photos can't be described, uploads are refused
     because the disk or the job queue is full, Redis takes no messages, no steward is running, or
     orphans are not collected.
     """
@@ -264,13 +264,11 @@ def _check_search(gateway: GatewayContext) -> ComponentStatus:
     except PlacewiseError as error:
         return ComponentStatus(status="unhealthy", detail=error.detail)
     problems = []
-    if status.unavailable:
-        problems.append(f"no search worker is available for: {', '.join(status.unavailable)}")
-    if status.missing:
-        named = ", ".join(status.missing[:MAX_NAMED_CHUNKS])
-        more = len(status.missing) - MAX_NAMED_CHUNKS
+    if status.unreadable:
+        named = ", ".join(status.unreadable[:MAX_NAMED_CHUNKS])
+        more = len(status.unreadable) - MAX_NAMED_CHUNKS
         problems.append(
-            f"{len(status.missing)} chunks can't be read: {named}"
+            f"{len(status.unreadable)} chunks can't be read: {named}"
             + (f" and {more} more" if more > 0 else "")
             + (
                 " (the cache disk of a search worker is full: free space in its PLACEWISE_HOME; "

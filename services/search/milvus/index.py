@@ -44,7 +44,6 @@ from shared.catalog.installation import get_or_create_installation
 from shared.catalog.maps import Map
 from shared.catalog.photos import PhotoFilterValues, list_photos_changed_since
 from shared.config.settings import Settings
-from shared.config.shards import SINGLE_SHARD
 from shared.errors import NotFound, Unavailable
 from shared.search_api.protocol import SearchRequest, SearchResponse
 from shared.storage import ObjectStore
@@ -91,7 +90,7 @@ class MilvusIndex:
     ) -> None:
         self._catalog = catalog
         self._store = store
-        self._folder = settings.search_cache_folder(SINGLE_SHARD)
+        self._folder = settings.search_cache_folder
         self._unreadable = unreadable
         self._milvus = Milvus(settings)
         self._fills: dict[UUID, dict[UUID, _Fill]] = {}  # by generation and chunk

@@ -151,7 +151,7 @@ class MilvusQuery:
             near = [hit for hit in found if hit.photo_id not in seen]
             seen |= {hit.photo_id for hit in near}
             if circle := request.photos.near:
-                near = [hit for hit in near if _is_in_circle(hit, circle)]
+                near = [hit for hit in near if is_in_circle(hit, circle)]
             exact, unread = self._score(snapshot.generation_id, near, query)
             scores |= exact
             unreadable |= unread
@@ -257,7 +257,8 @@ class MilvusQuery:
             count.found, count.expected = count.found // 2, count.expected // 2
 
 
-def _is_in_circle(hit: EngineHit, circle: Circle) -> bool:
+def is_in_circle(hit: EngineHit, circle: Circle) -> bool:
+    """Whether the photo is within the circle, not only in its bounding box."""
     away = distance_m(circle.latitude, circle.longitude, hit.latitude, hit.longitude)
     return away <= circle.radius_m
 
@@ -276,4 +277,5 @@ def _response(
         rows_reranked=compared,
         snapshot_version=snapshot.version,
         missing=missing,
+        filling=bool(set(snapshot.missing) - snapshot.unreadable),
     )

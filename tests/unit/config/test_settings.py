@@ -338,6 +338,7 @@ def test_every_secret_may_be_in_a_file(monkeypatch: pytest.MonkeyPatch, tmp_path
     secrets = {
         "ADMIN_KEY": "0123456789abcdef",
         "DATABASE_URL": "postgresql+psycopg://placewise:secret@db/placewise",
+        "MILVUS_URI": "http://user:secret@milvus:19530",
         "REDIS_URL": "redis://:secret@redis:6379/0",
         "S3_ACCESS_KEY": "placewise",
         "S3_SECRET_KEY": "secret",
