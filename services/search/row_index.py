@@ -23,7 +23,7 @@ class IndexSnapshot(Protocol):
 
     @property
     def unreadable(self) -> Collection[str]:
-        """Those that no wait will bring."""
+        """Those that can't be read."""
 
     @property
     def disk_full(self) -> bool: ...

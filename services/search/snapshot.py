@@ -40,8 +40,8 @@ class Snapshot:
 
     @property
     def unreadable(self) -> Collection[str]:
-        """Missing objects that no wait will bring."""
-        return () if self.disk_full else self.missing
+        """Missing objects that can't be read."""
+        return self.missing
 
     def read_row(self, object_key: str, row: int) -> Row | None:
         """Return a row as (dimension,) float32; None if its chunk is not loaded.

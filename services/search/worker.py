@@ -72,7 +72,7 @@ class QueryRowReader:
             Gone: `query_expired` if the row no longer exists.
             Unavailable: `chunk_unreadable` if the row's object is damaged.
         """
-        if request.object_key in snapshot.unreadable:
+        if request.object_key in snapshot.unreadable and not snapshot.disk_full:
             raise _unreadable_error(request.object_key)
         try:
             row = snapshot.read_row(request.object_key, request.row)

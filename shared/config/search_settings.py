@@ -10,6 +10,9 @@ from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings
 
 from shared.config.values import Size, split_list
+from shared.errors import Conflict
+
+MAX_MILVUS_DIMENSION = 32_768
 
 
 class SearchSettings(BaseSettings):
@@ -92,6 +95,22 @@ class SearchSettings(BaseSettings):
         if self.search_engine == "milvus" and self.milvus_uri is None:
             raise ValueError("SEARCH_ENGINE=milvus needs MILVUS_URI, such as http://milvus:19530")
         return self
+
+    def check_row_length(self, dimension: int | None) -> None:
+        """Raise Conflict (`rows_too_long`) for rows that the search engine can't hold."""
+        if self.search_engine == "milvus" and (dimension or 0) > MAX_MILVUS_DIMENSION:
+            raise Conflict(
+                "rows_too_long",
+                f"Milvus holds rows of at most {MAX_MILVUS_DIMENSION} numbers, and these have "
+                f"{dimension}. Reduce the descriptors by PCA: placewise maps switch NAME --pca "
+                "8192, which is possible before Milvus has them.",
+                dimension=dimension,
+            )
+
+    @property
+    def search_engine_name(self) -> str:
+        """Where rows are, in words."""
+        return "Milvus" if self.search_engine == "milvus" else "memory"
 
     @property
     def milvus_address(self) -> str:

@@ -279,7 +279,12 @@ def _check_search(gateway: GatewayContext) -> ComponentStatus:
         )
     if problems:
         return ComponentStatus(status="degraded", detail="; ".join(problems))
-    return ComponentStatus(status="healthy", detail=f"{status.rows} rows in memory")
+    detail = f"{status.rows} rows in {gateway.settings.search_engine_name}"
+    if filling := len(status.missing) - len(status.unreadable):
+        detail += f", {filling} chunks are still to be written"
+    if status.recalls:
+        detail += f", recall {min(status.recalls.values()):.3f} of recent answers"
+    return ComponentStatus(status="degraded" if filling else "healthy", detail=detail)
 
 
 def _check_messages(gateway: GatewayContext, depth: QueueDepth) -> QueueStatus:

@@ -191,6 +191,11 @@ class MilvusCollection:
             marks.pop(VERSION_MARK), frozenset(UUID(key.removeprefix(MARK)) for key in marks)
         )
 
+    def marked_version(self) -> int | None:
+        """Return the version of `marks`."""
+        found = self._query(f'photo == "{VERSION_MARK}"', ["captured_at"])
+        return found[0]["captured_at"] if found else None
+
     def mark_version(self, version: int) -> None:
         """Say that all changes up to this version are written."""
         self._mark(VERSION_MARK, version)

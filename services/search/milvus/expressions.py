@@ -64,10 +64,10 @@ def filter_expression(
         first, end = level + _hex(PATH_SEPARATOR), level + _hex(chr(ord(PATH_SEPARATOR) + 1))
         conditions.append(f'(place == "{level}" or (place >= "{first}" and place < "{end}"))')
     conditions += [f'array_contains(tags, "{_hex(tag)}")' for tag in photo_filter.tags]
-    conditions += [
-        f"array_contains_any(tags, {_texts(map(_hex, tags_with(part)))})"
-        for part in photo_filter.tags_like
-    ]
+    for part in photo_filter.tags_like:
+        like = _texts(map(_hex, tags_with(part)))
+        # Milvus refuses to look for one of no tags.
+        conditions.append(f"array_contains_any(tags, {like})" if like != "[]" else "photo in []")
     if photo_filter.captured_after is not None:
         conditions.append(f"captured_at >= {_microseconds(photo_filter.captured_after)}")
     if photo_filter.captured_before is not None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +16,7 @@ from uuid import UUID
 
 import numpy as np
 
-from services.search.chunk_loader import ChunkLoader, StoredChunk
+from services.search.chunk_loader import ChunkLoader
 from services.search.milvus.collections import (
     BATCH_BYTES,
     IDS_PER_CALL,
@@ -43,6 +42,7 @@ from shared.catalog.generations import Generation
 from shared.catalog.installation import get_or_create_installation
 from shared.catalog.maps import Map
 from shared.catalog.photos import PhotoFilterValues, list_photos_changed_since
+from shared.config.search_settings import MAX_MILVUS_DIMENSION
 from shared.config.settings import Settings
 from shared.errors import NotFound, Unavailable
 from shared.search_api.protocol import SearchRequest, SearchResponse
@@ -55,17 +55,6 @@ log = logging.getLogger(__name__)
 LOCK_SECONDS = 1.0  # wait for the worker that is writing the same generation
 STEP_SECONDS = 3.0  # of writing, between two snapshots
 COUNT_SECONDS = 60.0  # interval of the counts of what a collection holds
-
-
-@dataclass(slots=True, eq=False)
-class _Fill:
-    """A chunk that is being written: its rows that are not in the collection yet."""
-
-    chunk: Chunk
-    stored: StoredChunk
-    version: int
-    """Of the map, whose values the photos have."""
-    rows: deque[tuple[int, PhotoFilterValues]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,9 +82,8 @@ class MilvusIndex:
         self._folder = settings.search_cache_folder
         self._unreadable = unreadable
         self._milvus = Milvus(settings)
-        self._fills: dict[UUID, dict[UUID, _Fill]] = {}  # by generation and chunk
         self._count_due: dict[UUID, float] = {}
-        self._query = MilvusQuery(catalog, store, self._milvus.index)
+        self._query = MilvusQuery(catalog, store, settings)
 
     @cached_property
     def _prefix(self) -> str:
@@ -119,8 +107,6 @@ class MilvusIndex:
             if name.removeprefix(self._prefix).partition("_")[0] not in known:
                 log.info("dropping the collection %s, whose generation has ended", name)
                 self._milvus.drop(name)
-        for ended in self._fills.keys() - set(generation_ids):
-            del self._fills[ended]
 
     def needs_sync(self, snapshot: EngineSnapshot) -> bool:
         """Whether something is still to be written, or the collection is not as it was."""
@@ -132,14 +118,9 @@ class MilvusIndex:
         if time.monotonic() >= self._count_due.get(generation_id, 0.0):
             return True
         try:
-            marks = snapshot.collection.marks()
+            return snapshot.collection.marked_version() != snapshot.version
         except Unavailable:  # perhaps it was dropped
             return True
-        return (
-            marks is None
-            or marks.version < snapshot.version
-            or not snapshot.written <= marks.chunks
-        )
 
     def search(
         self, snapshot: EngineSnapshot, query: QueryRow, request: SearchRequest
@@ -162,14 +143,15 @@ class MilvusIndex:
             state = self._read_catalog(generation_id, marks)
             if state is None:
                 return None
-            if collection is None and is_writer and state.chunks:
+            fits = state.dimension <= MAX_MILVUS_DIMENSION  # or its queries are refused
+            if collection is None and is_writer and state.chunks and fits:
                 log.info("creating a collection for generation %s", generation_id)
                 collection = self._milvus.create(prefix, state.dimension, state.version)
                 marks = Marks(state.version, frozenset())
             if collection and marks and is_writer:
                 marks = self._write(generation_id, collection, marks, state)
         version = state.version if is_writer or marks is None else min(marks.version, state.version)
-        if marks is None and state.chunks:
+        if marks is None and state.chunks and fits:
             version = 0
         written = marks.chunks if marks else frozenset()
         missing = [chunk.object_key for chunk in state.chunks if chunk.id not in written]
@@ -189,13 +171,12 @@ class MilvusIndex:
         return ChunkLoader(self._store, self._folder / str(generation_id))
 
     def _read_catalog(self, generation_id: UUID, marks: Marks | None) -> _Generation | None:
-        fills = self._fills.get(generation_id, {}).values()
         with self._catalog.read() as session:
             generation = session.get(Generation, generation_id)
             if generation is None:
                 return None
             version = session.get_one(Map, generation.map_id).version
-            since = min([marks.version if marks else version, *(fill.version for fill in fills)])
+            since = marks.version if marks else version
             chunks = list_live_chunks(session, generation_id)
             counts = (
                 marks is not None
@@ -215,12 +196,7 @@ class MilvusIndex:
     ) -> Marks:
         """Write changes, then chunks until the time is over; return what is written."""
         changes = {photo.photo_id: photo for photo in state.changes}
-        fills = self._fills.setdefault(generation_id, {})
         self._apply_changes(collection, changes)
-        for fill in fills.values():
-            rows = ((row, changes.get(photo.photo_id, photo)) for row, photo in fill.rows)
-            fill.rows = deque((row, photo) for row, photo in rows if photo.deleted_at is None)
-            fill.version = state.version
         if marks.version < state.version:
             collection.mark_version(state.version)
         live = {chunk.id: chunk for chunk in state.chunks}
@@ -235,26 +211,19 @@ class MilvusIndex:
         ends_at = time.monotonic() + STEP_SECONDS
         # The newest first: a query may wait for a photo that was just published.
         for chunk_id in sorted(live.keys() - written, reverse=True):
-            chunk = live[chunk_id]
-            begun = fills.pop(chunk_id, None)
-            if begun is None or begun.stored.file.was_changed():
-                if not self._unreadable.is_due(chunk.object_key):
-                    continue
-                begun = self._open_fill(generation_id, collection, chunk, state.version)
-                if begun is None:
-                    continue
-            if not self._write_chunk(collection, begun, ends_at):
-                fills[chunk_id] = begun
-                log.info(
-                    "%d of %d rows of generation %s are in Milvus",
-                    collection.count(f'photo < "{MARK}"'),
-                    sum(chunk.rows for chunk in state.chunks),
-                    generation_id,
-                )
-                break
-            written.add(chunk_id)
+            if not self._unreadable.is_due(live[chunk_id].object_key):
+                continue
+            if self._write_chunk(generation_id, collection, live[chunk_id]):
+                written.add(chunk_id)
             if time.monotonic() >= ends_at:
                 break
+        if written != live.keys():
+            log.info(
+                "%d of %d rows of generation %s are in Milvus",
+                sum(chunk.rows for chunk in state.chunks if chunk.id in written),
+                sum(chunk.rows for chunk in state.chunks),
+                generation_id,
+            )
         return Marks(state.version, frozenset(written))
 
     @staticmethod
@@ -269,42 +238,29 @@ class MilvusIndex:
         for batch in _batches(rows):
             collection.put(batch)
 
-    def _write_chunk(self, collection: MilvusCollection, fill: _Fill, ends_at: float) -> bool:
-        """Write the rows of a chunk that are not there; return False when the time is over."""
-
-        def rows() -> Iterator[Row]:
-            while fill.rows:
-                row, photo = fill.rows.popleft()
-                vector = fill.stored.rows[row].astype(np.float32)
-                yield {**filter_columns(photo), "vector": vector}
-
-        for batch in _batches(rows()):
-            collection.put(batch)
-            if time.monotonic() >= ends_at:
-                break
-        if fill.rows:
-            return False
-        collection.mark_chunk(fill.chunk.id)
-        return True
-
-    def _open_fill(
-        self, generation_id: UUID, collection: MilvusCollection, chunk: Chunk, version: int
-    ) -> _Fill | None:
-        """Return what is to be written of a chunk; None if it can't be read."""
+    def _write_chunk(self, generation_id: UUID, collection: MilvusCollection, chunk: Chunk) -> bool:
+        """Write the rows of a chunk that are not there; return False if it can't be read."""
         loader = self._loader(generation_id)
         try:
-            stored = loader.load_rows(chunk)
+            stored = loader.load_rows(chunk).rows
         except (Unavailable, NotFound, ValueError, OSError) as error:
             self._unreadable.failed(chunk.object_key, error)
-            return None
+            return False
         finally:
             loader.evict_except([])  # what is mapped stays readable
         self._unreadable.succeeded(chunk.object_key)
         with self._catalog.read() as session:
             photos = list_live_filter_values(session, chunk.id)
         held = collection.held([photo.photo_id for _, photo in photos])
-        absent = deque((row, photo) for row, photo in photos if photo.photo_id not in held)
-        return _Fill(chunk, stored, version, absent)
+        rows = (
+            {**filter_columns(photo), "vector": stored[row].astype(np.float32)}
+            for row, photo in photos
+            if photo.photo_id not in held
+        )
+        for batch in _batches(rows):
+            collection.put(batch)
+        collection.mark_chunk(chunk.id)
+        return True
 
     def _find_losses(
         self, generation_id: UUID, collection: MilvusCollection, state: _Generation
@@ -333,7 +289,7 @@ class MilvusIndex:
 
 
 def _batches(rows: Iterable[Row]) -> Iterator[list[Row]]:
-    """Split rows into calls; a row is taken only when it is written next."""
+    """Split rows into calls."""
     batch: list[Row] = []
     size_bytes = 0
     for row in rows:

@@ -23,6 +23,7 @@ from shared.catalog.chunks import Chunk, find_descriptor_rows, list_live_filter_
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.photos import list_tags_with
+from shared.config.settings import Settings
 from shared.errors import NotFound, Unavailable
 from shared.geodesy import distance_m
 from shared.search_api.photo_filter import Circle
@@ -46,6 +47,7 @@ GROWTH = 4  # of the number of candidates, where too few pass the filter or deci
 READ_THREADS = 16
 RECALL_SECONDS = 60.0
 RECALL_QUERIES = 32
+RECALL_CHUNKS = 10
 MAX_COUNTED = 10_000  # rows, after which earlier ones count half
 
 
@@ -99,10 +101,11 @@ class _Recall:
 class MilvusQuery:
     """Answers queries; thread-safe."""
 
-    def __init__(self, catalog: Catalog, store: ObjectStore, index: str) -> None:
+    def __init__(self, catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
+        self._settings = settings
         self._catalog = catalog
         self._store = store
-        self._is_exact = index == "FLAT"
+        self._is_exact = settings.milvus_index == "FLAT"
         self._readers = ThreadPoolExecutor(READ_THREADS, "search-rows")
         self._lock = threading.Lock()
         self._suspects: dict[UUID, set[UUID]] = {}
@@ -134,6 +137,7 @@ class MilvusQuery:
         are off by at most an error of float32: an answer whose k-th cosine is larger than that
         product by both errors is complete.
         """
+        self._settings.check_row_length(snapshot.dimension)
         collection = snapshot.collection
         if collection is None or not query.any():
             return _response(snapshot, [], EXHAUSTIVE, 0, snapshot.missing)
@@ -223,36 +227,35 @@ class MilvusQuery:
     def measure_recall(
         self, generation_id: UUID, chunks: Sequence[Chunk], loader: ChunkLoader
     ) -> None:
-        """Compare recent answers with the rows of a random chunk, once a minute.
+        """Compare recent answers with the rows of random chunks, once a minute.
 
-        What of the chunk is more similar than an answer's last photo has to be in the answer.
+        What of a chunk is more similar than an answer's last photo has to be in the answer.
         """
-        recent = self._recent.get(generation_id)
-        if not recent or not chunks or time.monotonic() < self._recall_due:
+        if generation_id not in self._recent or time.monotonic() < self._recall_due:
             return
         self._recall_due = time.monotonic() + RECALL_SECONDS
-        chunk = random.choice(chunks)  # noqa: S311
-        try:
-            rows = loader.load_rows(chunk).rows
-        except (Unavailable, NotFound, ValueError, OSError) as unreadable:
-            log.warning("the recall can't be measured: %s", unreadable)
-            return
-        with self._catalog.read() as session:
-            photos = [
-                (row, photo.photo_id)
-                for row, photo in list_live_filter_values(session, chunk.id)
-                if photo.findable
-            ]
         with self._lock:
-            queries = [query for query in recent if chunk.id in query.chunks]
-            recent.clear()
+            answers = self._recent.pop(generation_id)
         count = self._counts.setdefault(generation_id, _Recall())
-        error = float32_error(rows.shape[1])
-        for query in queries:
-            for row, photo_id in photos:
-                if rows[row].astype(np.float32) @ query.vector > query.last_score + 2 * error:
-                    count.expected += 1
-                    count.found += photo_id in query.photo_ids
+        for chunk in random.sample(chunks, min(RECALL_CHUNKS, len(chunks))):
+            try:
+                rows = loader.load_rows(chunk).rows.astype(np.float32)
+            except (Unavailable, NotFound, ValueError, OSError) as unreadable:
+                log.warning("%s is left out of the recall: %s", chunk.object_key, unreadable)
+                continue
+            with self._catalog.read() as session:
+                photos = {
+                    row: photo.photo_id
+                    for row, photo in list_live_filter_values(session, chunk.id)
+                    if photo.findable
+                }
+            for answer in answers:
+                if chunk.id in answer.chunks:
+                    least = answer.last_score + 2 * float32_error(rows.shape[1])
+                    better = np.flatnonzero(rows @ answer.vector > least).tolist()
+                    expected = [photos[row] for row in better if row in photos]
+                    count.expected += len(expected)
+                    count.found += len(answer.photo_ids.intersection(expected))
         if count.expected > MAX_COUNTED:
             count.found, count.expected = count.found // 2, count.expected // 2
 

@@ -17,11 +17,13 @@ from services.search.milvus import query as query_module
 from services.search.milvus.collections import Milvus, MilvusCollection
 from services.search.milvus.expressions import filter_columns, filter_expression
 from services.search.worker import SearchWorker
+from shared.catalog.database.locks import hold_lock
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.photos import PhotoRole
+from shared.config import search_settings
 from shared.config.settings import Settings
-from shared.errors import Unavailable
+from shared.errors import Conflict, Unavailable
 from shared.search_api.photo_filter import PhotoFilter, is_part_of_tag
 from shared.search_api.protocol import SearchBackend
 from shared.storage import FolderStore
@@ -30,7 +32,7 @@ from tests.contract.search.test_search_backend import (
     SearchPortContract,
     whatever_the_catalog,
 )
-from tests.support.small_map import SmallMap, assert_answers, unit_rows
+from tests.support.small_map import DIMENSION, SmallMap, assert_answers, unit_rows
 from tests.unit.search.photo_filters import IDS, passes, photo_facts, photo_filters
 from tests.unit.search.search_rows import facts_of
 
@@ -82,6 +84,7 @@ def complete(worker: SearchWorker) -> None:
     raise AssertionError(worker.status())
 
 
+@whatever_the_catalog
 class TestSearchOnMilvus(SearchPortContract):
     """The same promises where the rows are in an engine."""
 
@@ -114,26 +117,38 @@ class TestSearchOnMilvus(SearchPortContract):
         complete(worker)
         assert_answers(worker.search(request), places.brute_force(vector, 20))
 
-    def test_large_chunk_is_written_in_steps_that_take_in_what_changes_meanwhile(
+    def test_collection_that_is_being_filled_takes_in_what_changes_meanwhile(
         self, places: SmallMap, worker: SearchWorker, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        photo_ids = places.add(unit_rows(1, 9))
+        photo_ids = [places.add(unit_rows(seed, 2))[0] for seed in range(5)]
         monkeypatch.setattr(index_module, "STEP_SECONDS", 0.0)
-        monkeypatch.setattr(index_module, "IDS_PER_CALL", 2)
         worker.sync()
         assert worker.status().rows == 2
         places.delete(photo_ids[0])
-        places.delete(photo_ids[7])
-        places.patch(photo_ids[8], tags=["new"])
-        places.add(unit_rows(2, 1))  # is written first
-        vector = unit_rows(3, 1)[0]
-        fresh = worker.search(places.request(places.query(vector), k=20))
-        assert sorted(places.rows)[-1] in {hit.photo_id for hit in fresh.hits}
-        complete(worker)
+        places.delete(photo_ids[4])
+        places.patch(photo_ids[1], tags=["new"])
+        (fresh,) = places.add(unit_rows(7, 1))  # is written first
+        vector = unit_rows(9, 1)[0]
         request = places.request(places.query(vector), k=20)
+        response = worker.search(request)
+        assert fresh in {hit.photo_id for hit in response.hits}
+        assert response.filling
+        complete(worker)
         assert_answers(worker.search(request), places.brute_force(vector, 20))
         tagged = places.request(places.query(vector), k=20, tags=("new",))
-        assert [hit.photo_id for hit in worker.search(tagged).hits] == [photo_ids[8]]
+        assert [hit.photo_id for hit in worker.search(tagged).hits] == [photo_ids[1]]
+
+    def test_rows_that_are_too_long_are_refused_with_what_helps(
+        self, places: SmallMap, worker: SearchWorker, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        for module in (index_module, search_settings):
+            monkeypatch.setattr(module, "MAX_MILVUS_DIMENSION", DIMENSION - 1)
+        places.add(unit_rows(1, 2))
+        worker.sync()
+        with pytest.raises(Conflict, match="maps switch NAME --pca 8192") as refused:
+            worker.search(places.request(places.query(unit_rows(1, 1)[0])))
+        assert refused.value.code == "rows_too_long"
+        assert worker.status().loaded == {}, "such a generation is not switched to"
 
     def test_rows_that_were_lost_or_added_behind_our_back_are_counted_and_put_right(
         self,
@@ -206,14 +221,13 @@ class TestSearchOnMilvus(SearchPortContract):
     ) -> None:
         places.add(unit_rows(1, 5))
         monkeypatch.setattr(index_module, "LOCK_SECONDS", 0.0)
-        with index_module.hold_lock(places.catalog, places.generation_id, 1.0) as is_writer:
+        with hold_lock(places.catalog, places.generation_id, 1.0) as is_writer:
             assert is_writer
             worker._index.sync(places.generation_id, None)
             assert milvus.names("placewise_") == []
         complete(worker)
         assert len(milvus.names("placewise_")) == 1
 
-    @whatever_the_catalog
     @pytest.mark.parametrize("index", ["HNSW", "IVF_FLAT"])
     def test_answers_of_an_approximate_index_say_so_and_its_recall_is_measured(
         self,
