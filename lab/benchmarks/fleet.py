@@ -194,7 +194,7 @@ class ServiceProcess:
 
 
 class Fleet:
-    """Services by name: `gateway-0..`, `extractor-0..`, `search-SHARD-REPLICA`, `steward-0..`.
+    """Services by name: `gateway-0..`, `extractor-0..`, `search-0..`, `steward-0..`.
 
     Settings are those of `shared.config.settings`; the default extractor is the tiny test
     extractor.

@@ -205,14 +205,18 @@ class SearchWorker:
     ) -> None:
         poll = ChangePoll(self._catalog)
         outage = OutageLog(f"search sync of {' and '.join(states)} generations")
+        failure = ""
         while not stop.is_set():
             try:
                 self.sync(states)
                 outage.record_success()
+                failure = ""
             except SQLAlchemyError as error:  # loaded snapshots go on serving queries
                 outage.record_error(error)
             except (OSError, Unavailable) as error:
-                log.error("sync failed, loaded snapshots go on serving queries: %s", error)
+                if failure != str(error):
+                    log.error("sync failed, loaded snapshots go on serving queries: %s", error)
+                failure = str(error)
             idle_seconds = FOLLOW_SECONDS if self._index.changes_alone else IDLE_SECONDS
             poll.wait(stop, FOLLOW_SECONDS, idle_seconds)
 

@@ -37,7 +37,8 @@ def server() -> Iterator[MilvusServer]:
 class Load:
     """Workers that follow the catalog, and threads that ask them without a pause."""
 
-    def __init__(self, places: SmallMap, settings: Settings) -> None:
+    def __init__(self, places: SmallMap, settings: Settings, server: MilvusServer) -> None:
+        self.server = server
         self.places = places
         self.workers = [
             SearchWorker(places.catalog, places.store, settings, max_wait_seconds=2.0)
@@ -103,6 +104,7 @@ class Load:
                         assert_answers(answer, self.places.brute_force(VECTOR, 100))
                         break
                 assert time.monotonic() < deadline, self.refusals[-3:]
+                self.server.supervise()
                 time.sleep(0.1)
 
 
@@ -114,7 +116,7 @@ def load(
     for seed in range(4):
         places.add(unit_rows(seed, 10))
     update = {"search_engine": "milvus", "milvus_uri": SecretStr(server.url)}
-    with Load(places, settings.model_copy(update=update)) as running:
+    with Load(places, settings.model_copy(update=update), server) as running:
         running.wait_until_whole()
         yield running
 

@@ -31,6 +31,12 @@ class MilvusServer:
     process: Daemon
     data: Path
 
+    def supervise(self) -> None:
+        """Start it again if it has ended: it does so itself when its lease in etcd runs out."""
+        if self.process.ended():
+            self.process.kill()
+            self.process.start()
+
     def lose_everything(self) -> None:
         """Start it again without its data."""
         self.process.kill()
