@@ -183,7 +183,9 @@ def load_worker(world: SyntheticMap) -> tuple[SearchWorker, Snapshot]:
     status = worker.status()
     assert not status.missing, status.missing
     assert status.rows == len(world.photo_ids), "every photo can be found"
-    return worker, worker.snapshot(world.generation_id, world.version)
+    snapshot = worker.snapshot(world.generation_id, world.version)
+    assert isinstance(snapshot, Snapshot)
+    return worker, snapshot
 
 
 def placewise_search(worker: SearchWorker, snapshot: Snapshot) -> SearchMethod:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Literal, Self
+from typing import Literal
 
-from pydantic import Field, SecretStr, field_validator, model_validator
+from pydantic import Field, SecretStr, field_validator
 from pydantic_settings import BaseSettings
 
 from shared.config.values import Size, split_list
@@ -89,12 +89,6 @@ class SearchSettings(BaseSettings):
         if not uri.endswith(".db") and not re.fullmatch(r"https?://[^\s/?#]+/?", uri):
             raise ValueError("MILVUS_URI is not a URL such as http://milvus:19530")
         return value
-
-    @model_validator(mode="after")
-    def _check_engine(self) -> Self:
-        if self.search_engine == "milvus" and self.milvus_uri is None:
-            raise ValueError("SEARCH_ENGINE=milvus needs MILVUS_URI, such as http://milvus:19530")
-        return self
 
     def check_row_length(self, dimension: int | None) -> None:
         """Raise Conflict (`rows_too_long`) for rows that the search engine can't hold."""

@@ -90,6 +90,10 @@ class Milvus:
             raise Misconfigured(
                 "no_milvus", "SEARCH_ENGINE=milvus needs the extra milvus: pip install pymilvus."
             ) from error
+        if not settings.milvus_address:
+            raise Misconfigured(
+                "no_milvus", "SEARCH_ENGINE=milvus needs MILVUS_URI, such as http://milvus:19530."
+            )
         logging.getLogger("pymilvus").setLevel(logging.CRITICAL)  # its errors are raised, too
         self._client_class = pymilvus.MilvusClient
         self._uri = settings.milvus_address

@@ -134,9 +134,6 @@ class Daemon:
         )
         self._ended()
 
-    def ended(self) -> bool:
-        return self._running().poll() is not None
-
     def pause(self) -> None:
         for process in self._family():
             with contextlib.suppress(psutil.NoSuchProcess):  # a child that has ended since

@@ -32,8 +32,8 @@ class MilvusServer:
     data: Path
 
     def supervise(self) -> None:
-        """Start it again if it has ended: it does so itself when its lease in etcd runs out."""
-        if self.process.ended():
+        """Start it again if its health check fails: it stays so when its lease in etcd ran out."""
+        if not self.process.answers():
             self.process.kill()
             self.process.start()
 
