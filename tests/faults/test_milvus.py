@@ -70,8 +70,6 @@ class Load:
         return self.places.request(self.reference, k=100, min_version=0)
 
     def __enter__(self) -> Load:
-        for worker in self.workers:
-            worker.sync()
         for thread in self._threads:
             thread.start()
         return self
