@@ -39,6 +39,7 @@ BATCH_BYTES = 16_000_000  # of rows in one call; a message may have 64 MB
 IDS_PER_CALL = 1000
 MAX_LIMIT = 16_384  # results of one search
 MAX_TEXT_BYTES = 65_535
+NO_COLLECTION = 100  # code of an error
 
 MARK = "~"  # begins the key of a mark; those of photos are hexadecimal digits
 VERSION_MARK = "~version"
@@ -73,6 +74,10 @@ class EngineHit:
     product: float
     latitude: float
     longitude: float
+
+
+class CollectionGone(Unavailable):
+    """Milvus does not know the collection."""
 
 
 class Milvus:
@@ -115,7 +120,8 @@ class Milvus:
             return getattr(client, method)(*args, timeout=timeout, **options)
         except Exception as error:  # of gRPC, too, and whatever a connection that broke leads to
             reason = str(getattr(error, "message", "") or error) or type(error).__name__
-            raise Unavailable(
+            gone = getattr(error, "code", None) == NO_COLLECTION
+            raise (CollectionGone if gone else Unavailable)(
                 "engine_unavailable",
                 f"Milvus does not answer a call ({method}): {reason}. Retry in a moment.",
             ) from error
@@ -125,18 +131,16 @@ class Milvus:
         return sorted(n for n in self.call("list_collections") if n.startswith(prefix))
 
     def open(self, prefix: str) -> MilvusCollection | None:
-        """Open the collection with this prefix; None if there is none."""
-        for name in self.names(prefix):
-            self.call("load_collection", name, timeout=WRITE_SECONDS)
-            return MilvusCollection(self, name)
-        return None
+        """Return the newest collection with this prefix; None if there is none."""
+        names = self.names(prefix)
+        return MilvusCollection(self, names[-1]) if names else None
 
     def create(self, prefix: str, dimension: int, version: int) -> MilvusCollection:
         """Create a collection without rows, whose photos are to be written as of `version`."""
         from pymilvus import DataType
 
         text = {"datatype": DataType.VARCHAR, "max_length": MAX_TEXT_BYTES}
-        name = f"{prefix}{new_id().hex[-12:]}"
+        name = f"{prefix}{new_id().hex}"  # in the order of the time
         schema = self._client_class.create_schema(auto_id=False, enable_dynamic_field=False)
         schema.add_field("photo", DataType.VARCHAR, is_primary=True, max_length=40)
         schema.add_field("vector", DataType.FLOAT_VECTOR, dim=dimension)
@@ -187,6 +191,7 @@ class MilvusCollection:
 
     def marks(self) -> Marks | None:
         """Return what the collection holds; None if it does not say so."""
+        self.milvus.call("load_collection", self.name, timeout=WRITE_SECONDS)
         found = self._query(f'photo >= "{MARK}"', ["photo", "captured_at"])
         marks = {row["photo"]: row["captured_at"] for row in found}
         if VERSION_MARK not in marks:

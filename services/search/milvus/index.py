@@ -7,6 +7,7 @@ cosines of an answer are computed from the rows of the chunks.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -21,6 +22,7 @@ from services.search.milvus.collections import (
     BATCH_BYTES,
     IDS_PER_CALL,
     MARK,
+    CollectionGone,
     Marks,
     Milvus,
     MilvusCollection,
@@ -54,6 +56,7 @@ log = logging.getLogger(__name__)
 
 LOCK_SECONDS = 1.0  # wait for the worker that is writing the same generation
 STEP_SECONDS = 3.0  # of writing, between two snapshots
+GONE_SECONDS = 30.0  # a server that was just started may not know its collections yet
 COUNT_SECONDS = 60.0  # interval of the counts of what a collection holds
 
 
@@ -83,6 +86,7 @@ class MilvusIndex:
         self._unreadable = unreadable
         self._milvus = Milvus(settings)
         self._count_due: dict[UUID, float] = {}
+        self._gone: dict[str, float] = {}  # monotonic seconds of the first failure
         self._query = MilvusQuery(catalog, store, settings)
 
     @cached_property
@@ -103,10 +107,14 @@ class MilvusIndex:
     def remove_others(self, held: Iterable[str], generation_ids: Collection[UUID]) -> None:
         """Drop those of these collections that belong to no generation of these."""
         known = {generation_id.hex for generation_id in generation_ids}
+        newest = {name.rpartition("_")[0]: name for name in held}
         for name in held:
-            if name.removeprefix(self._prefix).partition("_")[0] not in known:
-                log.info("dropping the collection %s, whose generation has ended", name)
-                self._milvus.drop(name)
+            of_generation = name.rpartition("_")[0]
+            ended = of_generation.removeprefix(self._prefix) not in known
+            if ended or newest[of_generation] != name:
+                log.info("dropping the collection %s, which is no longer used", name)
+                with contextlib.suppress(CollectionGone):
+                    self._milvus.drop(name)
 
     def needs_sync(self, snapshot: EngineSnapshot) -> bool:
         """Whether something is still to be written, or the collection is not as it was."""
@@ -136,10 +144,9 @@ class MilvusIndex:
         prefix = f"{self._prefix}{generation_id.hex}_"
         with hold_lock(self._catalog, generation_id, LOCK_SECONDS) as is_writer:
             collection = self._milvus.open(prefix)
-            marks = collection.marks() if collection else None
-            if collection and marks is None and is_writer:  # its creator was killed
-                self._milvus.drop(collection.name)
-                collection = None
+            marks = self._read_marks(collection) if collection else None
+            if collection and marks is None and is_writer:
+                collection = None  # a newer one takes its place
             state = self._read_catalog(generation_id, marks)
             if state is None:
                 return None
@@ -166,6 +173,21 @@ class MilvusIndex:
             live_rows=collection.count("findable == true") if collection else 0,
             dimension=state.dimension if state.chunks else 0,
         )
+
+    def _read_marks(self, collection: MilvusCollection) -> Marks | None:
+        """Return the marks; None if Milvus lists a collection that it has not.
+
+        It may be one that was being created or dropped when Milvus was killed.
+        """
+        try:
+            marks = collection.marks()
+        except CollectionGone:
+            since = self._gone.setdefault(collection.name, time.monotonic())
+            if time.monotonic() - since < GONE_SECONDS:
+                raise
+            return None
+        self._gone.pop(collection.name, None)
+        return marks
 
     def _loader(self, generation_id: UUID) -> ChunkLoader:
         return ChunkLoader(self._store, self._folder / str(generation_id))
