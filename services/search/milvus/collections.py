@@ -43,6 +43,7 @@ NO_COLLECTION = 100  # code of an error
 
 MARK = "~"  # begins the key of a mark; those of photos are hexadecimal digits
 VERSION_MARK = "~version"
+NOTHING = "~nothing"
 
 # Results are exact in float32 with FLAT only. Each is asked for more than it has to return: an
 # index that looks at few candidates misses some.
@@ -217,6 +218,14 @@ class MilvusCollection:
         """Say that some photos of these chunks are not written."""
         self._delete([MARK + chunk_id.hex for chunk_id in chunk_ids])
 
+    def settle(self) -> None:
+        """Let the searches of this process see all that any process has written before.
+
+        They wait for the time of this process's last write ("Session"): with "Strong" each would
+        wait for the present time, which Milvus announces five times a second.
+        """
+        self._delete([NOTHING])
+
     def _mark(self, key: str, number: int) -> None:
         vector = np.zeros(self.dimension, np.float32)
         vector[0] = 1
@@ -281,7 +290,7 @@ class MilvusCollection:
                 "metric_type": "IP",
                 "params": search_parameters(self.milvus.index, limit),
             },
-            consistency_level="Strong",
+            consistency_level="Session",
         )
         hits = ((hit["entity"], float(hit["distance"])) for hit in found)
         return [

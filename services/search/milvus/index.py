@@ -157,6 +157,8 @@ class MilvusIndex:
                 marks = Marks(state.version, frozenset())
             if collection and marks and is_writer:
                 marks = self._write(generation_id, collection, marks, state)
+        if collection and marks:
+            collection.settle()
         version = state.version if is_writer or marks is None else min(marks.version, state.version)
         if marks is None and state.chunks and fits:
             version = 0
