@@ -38,7 +38,7 @@ from shared.storage import OwnedStore
 MAX_WAIT_SECONDS = 60.0  # of `Prefer: wait` and `?wait=`
 NOTIFIER_POLL_SECONDS = 0.02  # poll interval while a request waits for the end of a job
 CHANGE_POLL_SECONDS = 0.25  # poll interval while a request waits for a change of a job
-POLL_COST_DIVISOR = 10  # polling takes at most one tenth of the time: slow polls become rare
+POLL_COST_DIVISOR = 2  # at most a third of the time is spent polling: slow polls become rare
 MAX_POLL_PAUSE_SECONDS = 1.0  # after a slow poll: the jobs of waiting requests may have ended
 # Requests may wait this long after the shutdown has begun. Most queries end within this time.
 SHUTDOWN_WAIT_SECONDS = 5.0
