@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -86,7 +87,7 @@ class MilvusIndex:
         self._unreadable = unreadable
         self._milvus = Milvus(settings)
         self._count_due: dict[UUID, float] = {}
-        self._gone: dict[str, float] = {}  # monotonic seconds of the first failure
+        self._gone: dict[UUID, float] = {}  # by generation: monotonic seconds of the first failure
         self._query = MilvusQuery(catalog, store, settings)
 
     @cached_property
@@ -139,14 +140,27 @@ class MilvusIndex:
     def sync(self, generation_id: UUID, old: EngineSnapshot | None) -> EngineSnapshot | None:
         """Write what a collection lacks, for a few seconds, and return what it holds then.
 
-        While another worker writes, this one reports what is there.
+        While another worker writes, this one reports what is there. Milvus may list a collection
+        that it no longer has, for example one that was being dropped when it was killed.
         """
+        try:
+            snapshot = self._sync(generation_id)
+        except CollectionGone:
+            self._gone.setdefault(generation_id, time.monotonic())
+            raise
+        self._gone.pop(generation_id, None)
+        return snapshot
+
+    def _sync(self, generation_id: UUID) -> EngineSnapshot | None:
         prefix = f"{self._prefix}{generation_id.hex}_"
         with hold_lock(self._catalog, generation_id, LOCK_SECONDS) as is_writer:
             collection = self._milvus.open(prefix)
-            marks = self._read_marks(collection) if collection else None
+            is_gone = time.monotonic() - self._gone.get(generation_id, math.inf) >= GONE_SECONDS
+            marks = collection.marks() if collection and not (is_gone and is_writer) else None
             if collection and marks is None and is_writer:
-                collection = None  # a newer one takes its place
+                log.warning("another collection takes the place of %s", collection.name)
+                self._gone.pop(generation_id, None)
+                collection = None
             state = self._read_catalog(generation_id, marks)
             if state is None:
                 return None
@@ -175,21 +189,6 @@ class MilvusIndex:
             live_rows=collection.count("findable == true") if collection else 0,
             dimension=state.dimension if state.chunks else 0,
         )
-
-    def _read_marks(self, collection: MilvusCollection) -> Marks | None:
-        """Return the marks; None if Milvus lists a collection that it has not.
-
-        It may be one that was being created or dropped when Milvus was killed.
-        """
-        try:
-            marks = collection.marks()
-        except CollectionGone:
-            since = self._gone.setdefault(collection.name, time.monotonic())
-            if time.monotonic() - since < GONE_SECONDS:
-                raise
-            return None
-        self._gone.pop(collection.name, None)
-        return marks
 
     def _loader(self, generation_id: UUID) -> ChunkLoader:
         return ChunkLoader(self._store, self._folder / str(generation_id))
