@@ -7,12 +7,10 @@ import threading
 import time
 from collections.abc import Iterator
 
-import numpy as np
 import pytest
 from pydantic import SecretStr
 
 from services.search.milvus import index as index_module
-from services.search.milvus.collections import Milvus
 from services.search.worker import SearchWorker
 from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
@@ -154,24 +152,3 @@ def test_calls_end_while_milvus_stands_still_and_go_on_afterwards(
         server.process.resume()
     load.wait_until_whole()
     load.check()
-
-
-def test_photos_come_and_go_while_a_collection_is_dropped_and_milvus_is_killed(
-    load: Load, server: MilvusServer, settings: Settings
-) -> None:
-    places = load.places
-    milvus = Milvus(settings.model_copy(update={"milvus_uri": SecretStr(server.url)}))
-    for seed in range(20, 26):
-        photo_ids = places.add(VECTOR[np.newaxis] + unit_rows(seed, 2) / 10)
-        places.delete(photo_ids[0])
-        if seed == 22:
-            for name in milvus.names("placewise_"):
-                milvus.drop(name)
-        if seed == 24:
-            load.wait_until_whole()  # killed in a creation, this release does not always recover
-            server.process.kill()
-            server.process.start()
-        places.merge()
-    load.wait_until_whole()
-    places.delete(photo_ids[1])
-    load.wait_until_whole()

@@ -121,11 +121,13 @@ class Milvus:
             return getattr(client, method)(*args, timeout=timeout, **options)
         except Exception as error:  # of gRPC, too, and whatever a connection that broke leads to
             reason = str(getattr(error, "message", "") or error) or type(error).__name__
-            gone = getattr(error, "code", None) == NO_COLLECTION
-            raise (CollectionGone if gone else Unavailable)(
+            unavailable = Unavailable(
                 "engine_unavailable",
                 f"Milvus does not answer a call ({method}): {reason}. Retry in a moment.",
-            ) from error
+            )
+            if getattr(error, "code", None) == NO_COLLECTION:
+                unavailable = CollectionGone(unavailable.code, unavailable.detail)
+            raise unavailable from error
 
     def names(self, prefix: str) -> list[str]:
         """Return the names of the collections with this prefix, in order."""
