@@ -50,7 +50,7 @@ test-lab: $(INSTALLED) ## tests of the lab (part of `make test`)
 	$(BIN)/python -m pytest tests/lab --numprocesses auto --dist loadfile --no-loadscope-reorder
 
 test-chaos: $(INSTALLED) ## kill, stop and restart services of a whole deployment under load
-	PLACEWISE_TEST_CHAOS=1 $(BIN)/python -m pytest tests/faults/test_chaos.py tests/faults/test_rolling.py --numprocesses 2 --dist loadfile
+	PLACEWISE_TEST_CHAOS=$${PLACEWISE_TEST_CHAOS:-1} $(BIN)/python -m pytest tests/faults/test_chaos.py tests/faults/test_rolling.py --numprocesses 2 --dist loadfile
 
 test-fast: $(INSTALLED) ## unit and contract tests that need no server
 	$(BIN)/python -m pytest tests/unit tests/contract tests/lab/unit tests/lab/contract -m "not servers" --numprocesses logical --dist loadfile

@@ -104,6 +104,15 @@ class AsyncClient(AsyncTransport):
         headers = {"Content-Type": "application/x-ndjson"}
         return await self._start_batch(content=body, headers=headers)
 
+    async def sync_library(self, *, every_hours: int | None = None) -> answers.Started:
+        """Bring the map up to date with the photo library of the server's settings.
+
+        Args:
+            every_hours: Hours between the end of a run and the next; None: once.
+        """
+        body = {"every_hours": every_hours}
+        return answers.Started(**await self._call("POST", "/library-syncs", json=body))
+
     async def import_prefix(self, prefix: str) -> answers.BatchStarted:
         """Start a batch import of all photos in the server's store below a key prefix."""
         return await self._start_batch(files={"prefix": (None, prefix)})
@@ -119,7 +128,7 @@ class AsyncClient(AsyncTransport):
     async def similar(
         self,
         /,
-        photo: str | Path | answers.Photo | UUID,
+        photo: str | Path | BinaryIO | answers.Photo | UUID,
         top_k: int = 10,
         min_score: float | None = None,
         matches: int | None = None,
@@ -133,7 +142,8 @@ class AsyncClient(AsyncTransport):
         """Find the most similar photos and estimate the place.
 
         Args:
-            photo: A file, which is not stored, or a stored photo (a Photo or its UUID).
+            photo: A file (its path, or open for reading bytes), which is not stored, or a stored
+                photo (a Photo or its UUID).
             top_k: Maximum number of results.
             min_score: Minimum cosine similarity.
             matches: Number of first results whose local features are matched with the photo's, 0 to
@@ -148,6 +158,7 @@ class AsyncClient(AsyncTransport):
             filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
                 `captured_before`, `place`, `place_under`, `tags`, `tags_like` and `ids`
                 (comma-separated); `certainty` is the share of answers that must be right;
+                `guarantee` instead that of all queries that may get a wrong answer;
                 `elsewhere` the share of queries that are from elsewhere than the map;
                 `history=False` leaves the search out of the search history.
         """
@@ -168,7 +179,8 @@ class AsyncClient(AsyncTransport):
             file_id = photo.image_id if isinstance(photo, answers.Photo) else photo
             answer = await self._call("POST", f"/similarity/{file_id}", **options)
         else:
-            answer = await self._send_file("/similarity", Path(photo), **options)
+            file = Path(photo) if isinstance(photo, (str, Path)) else photo
+            answer = await self._send_file("/similarity", file, **options)
         if "result_url" in answer:
             async for _ in self.watch(answer["job_id"]):
                 pass

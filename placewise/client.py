@@ -146,6 +146,7 @@ class Client:
     upload_direct = _blocking(AsyncClient.upload_direct)
     upload_files = _blocking(AsyncClient.upload_files)
     import_objects = _blocking(AsyncClient.import_objects)
+    sync_library = _blocking(AsyncClient.sync_library)
     import_prefix = _blocking(AsyncClient.import_prefix)
     batch_items = _iterating(AsyncClient.batch_items)
     similar = _blocking(AsyncClient.similar)

@@ -1,4 +1,4 @@
-"""The embedded server: gateway, extractor, search and steward in one process.
+"""The embedded server: gateway, search and steward in one process, the extractor in another.
 
 It needs no other servers: it uses SQLite and a local folder, or a bucket if S3_ENDPOINT is set. It
 runs the same classes as the separate services with other adapters, which the first table of
@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import uvicorn
 from prometheus_client import CollectorRegistry
 
+from services.embedded_extractor import ExtractorProcess, extractor_lock
 from services.gateway.app import create_app
 from services.gateway.authentication import (
     ApiKeyAuthenticator,
@@ -33,6 +34,7 @@ from services.search.worker import SearchWorker
 from services.service_process import start_service_threads, stop_when_a_thread_crashes
 from services.steward.batches.worker import BatchWorker
 from services.steward.evaluation_worker import EvaluationWorker
+from services.steward.library_sync import LibrarySyncWorker
 from services.steward.metrics import StewardMetrics
 from services.steward.scheduler import Scheduler
 from services.steward.tasks.maintenance import reclaim_leases
@@ -42,16 +44,14 @@ from shared.catalog.database.schema import migrate, sqlite_file
 from shared.catalog.database.session import REQUEST_TIMEOUTS, Catalog
 from shared.catalog.generations import RowType
 from shared.catalog.installation import check_before_new_catalog, open_installation_store
-from shared.catalog.jobs import EXTRACTOR_JOBS
 from shared.catalog.maps import get_or_create_default_map
-from shared.catalog.processes import delete_dead_search_workers, delete_processes, process_heartbeat
+from shared.catalog.processes import delete_dead_search_workers, delete_processes
 from shared.catalog.tables import open_catalog
 from shared.config.disk_space import DiskReserve
 from shared.config.embedded_home import announce_server, lock_home
 from shared.config.settings import Settings
 from shared.errors import Misconfigured, PlacewiseError
 from shared.jobs import InProcessWakeups
-from shared.jobs.runner import IDLE_POLL_SECONDS, JobRunner
 from shared.security.api_keys import Scope, generate_local_key, hash_api_key, is_loopback
 from shared.telemetry.logs import configure_logging
 from shared.telemetry.metrics_server import serve_metrics
@@ -110,8 +110,8 @@ def serve_standalone(settings: Settings, on_ready: Callable[[Standalone], None])
 def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Iterator[Standalone]:
     """Context manager that starts all services and stops them at the end.
 
-    The extractor is loaded in its own thread, because importing torch takes seconds: at once, or
-    with `lazy_extractor` when the first of its jobs is queued.
+    The extractor's process is started at once, or with `lazy_extractor` when the first of its jobs
+    is queued.
 
     Locks PLACEWISE_HOME first. If the catalog is in that folder, the leases and registrations of a
     killed process are deleted; with DATABASE_URL they may be those of running services, and expire.
@@ -130,9 +130,13 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
             "SEARCH_URLS is set, but the embedded server searches in its own process. Unset "
             "SEARCH_URLS, or run placewise gateway, extractor and steward.",
         )
-    home = settings.placewise_home
+    home, name = settings.placewise_home, f"embedded-{os.getpid()}"
     with contextlib.ExitStack() as stack:
+        extractor = ExtractorProcess(settings, name, lazy=lazy_extractor)
+        stack.callback(extractor.end)
         stack.enter_context(lock_home(home))
+        with extractor_lock(home):
+            pass  # the extractor of a server that was killed has ended
         listener = stack.enter_context(listen(settings.host, settings.port))
         catalog = open_catalog(settings, "embedded")
         stack.callback(catalog.close)
@@ -141,7 +145,7 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         check_before_new_catalog(catalog, settings)
         migrate(catalog)
         store = open_installation_store(catalog, settings, exclusive=True)
-        wakeups = InProcessWakeups()
+        wakeups = InProcessWakeups(extractor.look)
         with catalog.write() as session:
             get_or_create_default_map(
                 session, settings.new_map_extractor, RowType(settings.descriptor_rows)
@@ -154,6 +158,7 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
             reclaim_leases(catalog, wakeups, all_leases=True)
 
         registry = CollectorRegistry()  # shared: /metrics has the metrics of all services
+        registry.register(extractor)
         stack.enter_context(serve_metrics(settings, registry))
         # After everything that can fail: a key that is created but not shown would be lost.
         host, port = listener.getsockname()[:2]
@@ -163,11 +168,11 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         stack.enter_context(announce_server(home, url, local_key))
 
         search = SearchWorker(catalog, store, settings)
-        name = f"embedded-{os.getpid()}"
         heartbeat = WorkerHeartbeat(catalog, search, name)
         steward_metrics = StewardMetrics(registry)
         steward = Scheduler(catalog, store, wakeups, settings, steward_metrics)
         evaluator = EvaluationWorker(catalog, search, settings, name, steward_metrics)
+        libraries = LibrarySyncWorker(catalog, settings, name, steward_metrics)
         webhooks = WebhookDispatcher(catalog, settings)
         batches = BatchWorker(catalog, store, wakeups, settings, name, steward_metrics)
         metered_search = MeteredSearch(search, registry)
@@ -186,40 +191,25 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         )
         running = Standalone(url, gateway.lan_url, server, listener, first_admin_key, local_key)
 
-        def run_extractor(stop: threading.Event) -> None:
-            if lazy_extractor:
-                _wait_for_extractor_jobs(catalog, settings, wakeups, stop)
-            if stop.is_set():
-                return
-            from services.extractor.worker import ExtractorWorker
-
+        def run_extractor(_stop: threading.Event) -> None:
             try:
-                extractor = ExtractorWorker(
-                    catalog, store, settings, name, only_worker=True, registry=registry
-                )
+                extractor.run(catalog)
             except PlacewiseError as error:
                 running.stop(error)
-                return
-            with (
-                contextlib.closing(extractor),
-                process_heartbeat(catalog, "extractor", extractor.state),
-            ):
-                threads = start_service_threads({"fits": extractor.fits.run}, stop)
-                extractor.warm_up(stop)
-                extractor.run(stop, wakeups.wait)
-                for thread in threads:
-                    thread.join()
 
         stop = threading.Event()
         stack.enter_context(stop_when_a_thread_crashes(running.stop))
+        catalog.commits.announce = extractor.look
+        extractor.look()
         threads = start_service_threads(
             {
                 "search": search.run,
                 "search of building generations": search.run_building,
                 "search heartbeat": heartbeat.run,
-                "extractor": run_extractor,
+                "extractor process": run_extractor,
                 "steward": steward.run,
                 "evaluator": evaluator.run,
+                "libraries": libraries.run,
                 "batches": batches.run,
                 "webhooks": webhooks.run,
             },
@@ -230,16 +220,9 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         finally:
             stop.set()
             wakeups.send()
+            extractor.end()
             for thread in threads:
                 thread.join()
-
-
-def _wait_for_extractor_jobs(
-    catalog: Catalog, settings: Settings, wakeups: InProcessWakeups, stop: threading.Event
-) -> None:
-    runner = JobRunner(catalog, settings, "extractor", EXTRACTOR_JOBS, lambda *_: None)
-    while not stop.is_set() and not runner.run_once(runner.has_jobs, stop):
-        wakeups.wait(IDLE_POLL_SECONDS)
 
 
 def _create_authenticator(

@@ -103,12 +103,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run a test of the catalog on both databases, a test of `integration` on PostgreSQL, or on
-    those that its nearest marker names."""
+    """Run a test of the catalog on both databases, a test of `integration` on SQLite, or on those
+    that its nearest marker names."""
     if "catalog_kind" in metafunc.fixturenames:
         marker = metafunc.definition.get_closest_marker("databases")
         integration = _kind(metafunc.definition.path) == "integration"
-        default = ("postgresql",) if integration else ("sqlite", "postgresql")
+        default = ("sqlite",) if integration else ("sqlite", "postgresql")
         metafunc.parametrize("catalog_kind", marker.args if marker else default)
 
 

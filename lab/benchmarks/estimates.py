@@ -13,7 +13,8 @@ database photos only, as that of a live map is, and judged
 - on a random half of the set's queries, with the other half as labelled queries, as often;
 - on the set's queries with a quarter of the map's second coarsest labels left out, such as floors,
   four times: how many of the photos of these labels get an answer;
-- on photos of elsewhere, those of each of the other folders: how many get an answer.
+- on photos of elsewhere, those of each of the other folders: how many get an answer. Probabilities
+  are also judged on the queries with as many of them as the prior says.
 
 Intervals are those of the cluster bootstrap (`shared/evaluation/bootstrap.py`).
 """
@@ -25,6 +26,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -40,7 +42,7 @@ from lab.evaluation.query_clusters import cluster_queries
 from services.cli.environment import read_settings
 from services.cli.output import JsonOption, Table
 from shared.errors import InvalidRequest, Misconfigured
-from shared.evaluation.bootstrap import bootstrap_intervals
+from shared.evaluation.bootstrap import share_intervals
 from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.evidence import (
     EVIDENCE_DEPTH,
@@ -50,7 +52,12 @@ from shared.evaluation.places.evidence import (
 )
 from shared.evaluation.places.fit import MapScores, PlaceSample, fit_place_model
 from shared.evaluation.places.levels import LevelScheme, candidate_levels
-from shared.evaluation.places.probability import MapExtent, PlaceEstimate, PlaceModel
+from shared.evaluation.places.probability import (
+    ELSEWHERE_SHARE,
+    MapExtent,
+    PlaceEstimate,
+    PlaceModel,
+)
 from shared.evaluation.places.samples import (
     IndexRanking,
     MatchOwnPhoto,
@@ -104,6 +111,10 @@ class Judged:
     is_right: Sequence[bool | None]
     cluster: int
     """of the bootstrap"""
+
+    @property
+    def is_placed(self) -> bool:
+        return self.estimate.answer is not None or self.estimate.in_map is True
 
     @property
     def is_finest(self) -> bool:
@@ -184,8 +195,16 @@ def add_published(report: Report, what: str, photos: DescribedPhotos) -> list[Ju
     model = trial.fit()
     judged = trial.judge(model, np.flatnonzero(photos.is_query))
     add_judged(report, f"{what}, its queries", judged)
-    for name, numbers in photos.foreign.items():
-        add_foreign(report, f"{what}, photos of {name}", trial.judge(model, numbers))
+    foreign = {name: trial.judge(model, numbers) for name, numbers in photos.foreign.items()}
+    for name, each in foreign.items():
+        share = Share(
+            "answered or in the map", each, lambda j: j.is_placed, at_most=100 * (1 - CERTAINTY)
+        )
+        _add_shares(report, f"{what}, photos of {name}", share)
+    elsewhere = list(chain(*foreign.values()))
+    if count := min(len(elsewhere), round(len(judged) * ELSEWHERE_SHARE / (1 - ELSEWHERE_SHARE))):
+        mixed = [*judged, *elsewhere[:: len(elsewhere) // count][:count]]
+        _add_reliability(report, f"{what}, with {ELSEWHERE_SHARE:.0%} from elsewhere", mixed)
     return judged
 
 
@@ -309,7 +328,8 @@ class TrialMap:
             if estimate is not None:
                 truth = self.photos.locations[query]
                 # The whole map is judged by the photos of elsewhere.
-                right = [level.is_right(truth) for level in estimate.levels[:-1]]
+                finer = estimate.levels[:-1]
+                right = [level.is_right(truth) if truth.is_known else False for level in finer]
                 right.append(self.has_place(query))
                 judged.append(Judged(estimate, right, int(self.photos.clusters[query])))
         return judged
@@ -333,12 +353,8 @@ class TrialMap:
     def query_sample(self, query: int, spread: float) -> PlaceSample:
         """Return the sample of a photo of the set."""
         truth = self.photos.locations[query]
-        levels = candidate_levels(
-            *self.search(query),
-            self.photos.scheme,
-            spread,
-            self.photos.radius_m,
-        )
+        scheme, radius_m = self.photos.scheme, self.photos.radius_m
+        levels = candidate_levels(*self.search(query), scheme, spread, radius_m)
         return PlaceSample(query, levels, [level.is_right(truth) for level in levels])
 
 
@@ -376,12 +392,8 @@ def left_out_labels(photos: DescribedPhotos) -> Iterable[Mask]:
 
 def add_judged(report: Report, what: str, judged: Sequence[Judged]) -> None:
     """Report the shares of answers and of right ones among them, in %, and their calibration."""
-    if judged:
-        _add_answers(report, what, judged)
-        _add_reliability(report, what, judged)
-
-
-def _add_answers(report: Report, what: str, judged: Sequence[Judged]) -> None:
+    if not judged:
+        return
     known = [j for j in judged if j.is_answer_right is not None]
     finest = [j for j in known if j.is_finest]
     precision = 100 * CERTAINTY
@@ -393,6 +405,7 @@ def _add_answers(report: Report, what: str, judged: Sequence[Judged]) -> None:
         Share("answered at the finest level", judged, lambda j: j.is_finest, at_least=40),
         Share("right there", finest, lambda j: j.is_answer_right is True, at_least=precision),
     )
+    _add_reliability(report, what, judged)
 
 
 def _add_reliability(report: Report, what: str, judged: Sequence[Judged]) -> None:
@@ -426,17 +439,6 @@ def add_left_out(report: Report, what: str, photos: DescribedPhotos) -> None:
         )
 
 
-def add_foreign(report: Report, what: str, judged: Sequence[Judged]) -> None:
-    """Report the shares of photos of elsewhere that get an answer, and that are in the map."""
-    most = 100 * (1 - CERTAINTY)
-    _add_shares(
-        report,
-        what,
-        Share("answered", judged, lambda j: j.estimate.answer is not None, at_most=most),
-        Share("in the map", judged, lambda j: j.estimate.in_map is True, at_most=most),
-    )
-
-
 def _rank(scores: NDArray[np.float32], without: int | None = None) -> IndexRanking:
     order = np.argsort(-scores, kind="stable")
     order = order[order != without] if without is not None else order
@@ -447,13 +449,13 @@ def _add_shares(report: Report, what: str, *shares: Share) -> None:
     """Report shares in %, 100 % of no estimates, and show them with their intervals."""
     table = Table("share", "%", "95 % interval", title=what)
     for share in shares:
-        values = np.array([100.0 * share.counts(j) for j in share.judged])[:, None]
-        mean = float(values.mean()) if len(values) else 100.0
+        values = np.array([float(share.counts(j)) for j in share.judged])[:, None]
+        mean = 100 * float(values.mean()) if len(values) else 100.0
         report.add(
             f"{what}: {share.name}", mean, "%", at_most=share.at_most, at_least=share.at_least
         )
         clusters = np.array([j.cluster for j in share.judged], dtype=np.int64)
-        intervals = bootstrap_intervals(values, clusters)
-        bounds = f"{intervals[0].low:.1f} to {intervals[0].high:.1f}" if intervals else ""
+        intervals = share_intervals(values, clusters)
+        bounds = intervals[0].as_percent() if intervals else ""
         table.add_row(share.name, f"{mean:.1f}", bounds)
     report.tables.append(table)

@@ -27,7 +27,6 @@ import torch
 import typer
 from sqlalchemy import select
 
-from lab.benchmarks.fleet import Fleet, ServiceProcess, open_fleet, start_servers
 from lab.benchmarks.load_generator import (
     make_jpegs,
     multipart_forms,
@@ -44,6 +43,7 @@ from shared.imaging.preprocessing import Pixels
 from shared.matching.detectors import DETECTORS, Detector, Keypoints
 from shared.matching.features import MAX_KEYPOINTS, WORKING_SIDE
 from shared.search_api.client import HttpSearchClient
+from tests.support.fleet import Fleet, ServiceProcess, open_fleet, start_servers
 from tests.support.servers.daemon import free_ports
 
 TARGET_OWN_MILLISECONDS, TARGET_DECODER_MILLISECONDS = 1.5, 12.0

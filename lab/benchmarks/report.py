@@ -83,13 +83,12 @@ class Report:
         seconds: Sequence[float],
         *,
         p95_at_most_ms: float | None = None,
-        worst_at_most_ms: float | None = None,
     ) -> None:
         """Add p50, p95 and the maximum of durations in seconds, as milliseconds."""
         found = LatencySummary.of(seconds)
         self.add(f"{what}, p50", 1000 * found.median, "ms")
         self.add(f"{what}, p95", 1000 * found.p95, "ms", at_most=p95_at_most_ms)
-        self.add(f"{what}, worst", 1000 * found.worst, "ms", at_most=worst_at_most_ms)
+        self.add(f"{what}, worst", 1000 * found.worst, "ms")
 
     @property
     def missed(self) -> bool:

@@ -16,8 +16,6 @@ from services.cli.environment import require_packages
 BENCHMARKS = (
     "search",
     "pipeline",
-    "query-latency",
-    "chaos",
     "estimates",
     "matches",
     "extract",

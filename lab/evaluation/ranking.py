@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -155,15 +156,9 @@ def evaluate_recall(
     `on_progress` is called with the stage (`database`, `queries`, `search`), done and total. Raises
     what `describe` and `exact_knn` raise.
     """
-    described = describe_evaluation_set(describe, evaluation_set, on_progress=on_progress)
-    with described as (database, queries):
-        ranked = exact_knn(
-            queries,
-            database,
-            max(ks),
-            faiss_gpu=faiss_gpu,
-            on_progress=lambda done, total: on_progress("search", done, total),
-        )
+    with describe_evaluation_set(describe, evaluation_set, on_progress) as (database, queries):
+        search = partial(on_progress, "search")
+        ranked = exact_knn(queries, database, max(ks), faiss_gpu=faiss_gpu, on_progress=search)
         dimension = database.shape[1]
     return RecallEvaluation(
         ranked, compute_recalls(ranked.indices, evaluation_set.positives, ks), dimension
@@ -174,7 +169,6 @@ def evaluate_recall(
 def describe_evaluation_set(
     describe: DescribeFunction,
     evaluation_set: EvaluationSet,
-    *,
     on_progress: ProgressCallback = lambda what, done, total: None,
 ) -> Iterator[tuple[Rows, Rows]]:
     """Describe a set into the (m, D) float32 descriptors of its database and (n, D) of its queries.
@@ -183,11 +177,8 @@ def describe_evaluation_set(
     """
 
     def describe_photos(stage: str, photos: Sequence[DatasetPhoto]) -> AbstractContextManager[Rows]:
-        return describe_to_matrix(
-            describe,
-            [photo.path for photo in photos],
-            on_progress=lambda done, total: on_progress(stage, done, total),
-        )
+        paths = [photo.path for photo in photos]
+        return describe_to_matrix(describe, paths, on_progress=partial(on_progress, stage))
 
     with (
         describe_photos("database", evaluation_set.database) as database,

@@ -24,7 +24,7 @@ from shared.evaluation.bootstrap import (
     CONFIDENCE_LEVEL,
     RESAMPLES,
     ConfidenceInterval,
-    bootstrap_intervals,
+    share_intervals,
 )
 from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.fit import RegressionTable, fit_map_estimate
@@ -283,7 +283,7 @@ def compute_metrics(
     findable = positive_counts > 0
     precisions = average_precisions(hits, positive_counts)[findable]
     findable_values = np.column_stack([within[findable], precisions])
-    intervals = bootstrap_intervals(findable_values, clusters.labels[findable])
+    intervals = share_intervals(findable_values, clusters.labels[findable])
     curve = calibration = None
     if scores is not None:
         first = scores[:, 0], hits[:, 0], int(findable.sum())
@@ -292,7 +292,7 @@ def compute_metrics(
         recalls=compute_recalls(ranked, positives, ks),
         hits=hits,
         within=within,
-        recall_intervals=bootstrap_intervals(within, clusters.labels),
+        recall_intervals=share_intervals(within, clusters.labels),
         findable_intervals=intervals[:-1] if intervals else None,
         mean_average_precision=float(precisions.mean()) if len(precisions) else float("nan"),
         map_interval=intervals[-1] if intervals else None,

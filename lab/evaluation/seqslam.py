@@ -1,4 +1,4 @@
-"""SeqSLAM with constant velocity and a plain hidden Markov model, which tracks are compared with.
+"""SeqSLAM with constant velocity, which tracks are compared with.
 
 Each frame is matched by the sum of the scores of the last ten frames along straight lines of
 constant velocity through the map (Milford and Wyeth 2012, "SeqSLAM: Visual route-based navigation
@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, eye_array
-from scipy.spatial import cKDTree
 
 FloatArray = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -23,7 +21,6 @@ DIRECTIONS = 12
 PLANE_SPEEDS = (0.7, 1.0)
 """times the typical speed"""
 LINE_SPEEDS = (0.8, 0.9, 1.0, 1.1, 1.2)
-HMM_JUMP = 0.01
 
 
 def seqslam_matches(
@@ -65,28 +62,6 @@ def seqslam_matches(
         best_cell = int(sums.max(axis=0).argmax())
         members = np.flatnonzero(cell_of == best_cell)
         matches[frame] = members[standardised[frame, members].argmax()]
-    return matches
-
-
-def hmm_matches(scores: NDArray[np.float32], positions: FloatArray, reach: float) -> Indices:
-    """Match the frames of a sequence by the forward pass of a hidden Markov model.
-
-    Between two frames the camera moves to any photo within `reach` with the same probability, or
-    with HMM_JUMP to any other. The likelihood of a photo is exp(standardised score). The arguments
-    are those of `seqslam_matches`.
-    """
-    count = len(positions)
-    pairs = cKDTree(positions).query_pairs(reach, output_type="ndarray")
-    near = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    near = near + near.T + eye_array(count)
-    degrees = near.sum(axis=1)
-    belief = np.full(count, 1 / count)
-    matches = np.zeros(len(scores), dtype=np.int64)
-    for frame, standardised in enumerate(_standardise(scores)):
-        belief = (1 - HMM_JUMP) * (near @ (belief / degrees)) + HMM_JUMP / count
-        belief *= np.exp(standardised)
-        belief /= belief.sum()
-        matches[frame] = int(belief.argmax())
     return matches
 
 

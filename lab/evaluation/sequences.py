@@ -22,7 +22,7 @@ from lab.datasets.ground_truth import parse_rule
 from lab.evaluation.array_photo_graph import ArrayPhotoGraph
 from lab.evaluation.confidence_metrics import recall_at_precision
 from lab.evaluation.places import RANKS, SAMPLED_PHOTOS, measure_background
-from lab.evaluation.seqslam import hmm_matches, seqslam_matches
+from lab.evaluation.seqslam import seqslam_matches
 from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
 from shared.evaluation.places.fit import MapScores, fit_place_model
@@ -48,8 +48,6 @@ KIDNAPS = 6
 FOUND_FRAMES = 40
 """frames after which a track that was carried away must be right again"""
 SEQSLAM_CELL_M = 12.0
-HMM_FRAMES = 2.0
-"""that the hidden Markov model moves in a step, at most, along a map without coordinates"""
 STOPS = 4
 STOP_FRAMES = 30
 
@@ -65,7 +63,6 @@ class FrameResult:
     """whether the track begins here: first frame, back in the map, or carried away"""
     single_is_right: bool
     seqslam_is_right: bool
-    hmm_is_right: bool
     filter_is_right: bool
     smoothed_is_right: bool
     single_score: float
@@ -192,7 +189,7 @@ def evaluate_sequence(
         states.append(track_filter.state(belief))
     seconds = (time.process_time() - started) / max(len(evidence), 1)
     smoothed = track_filter.smoothed_states(evidence)
-    matches = _peers(map_, scores, motion)
+    seqslam = _seqslam(map_, scores, motion)
     results = []
     for number, index in enumerate(members):
         positives = set(evaluation_set.positives[index].tolist())
@@ -202,8 +199,7 @@ def evaluate_sequence(
                 has_positive=bool(positives),
                 is_start=bool(positives) and _is_start(evaluation_set, members, number),
                 single_is_right=int(scores[number].argmax()) in positives,
-                seqslam_is_right=int(matches["seqslam"][number]) in positives,
-                hmm_is_right=int(matches["hmm"][number]) in positives,
+                seqslam_is_right=int(seqslam[number]) in positives,
                 filter_is_right=_photo(states[number].photo) in positives,
                 smoothed_is_right=_photo(smoothed[number].photo) in positives,
                 single_score=float(scores[number].max()),
@@ -322,20 +318,14 @@ def _is_start(evaluation_set: EvaluationSet, members: Sequence[int], number: int
     return bool(np.hypot(*(metres[1] - metres[0])) > JUMP_M)  # not for unknown ones, NaN
 
 
-def _peers(map_: SequenceMap, scores: Rows, motion: MotionModel) -> dict[str, NDArray[np.int64]]:
-    """Return the matches of SeqSLAM and of the hidden Markov model."""
+def _seqslam(map_: SequenceMap, scores: Rows, motion: MotionModel) -> NDArray[np.int64]:
     eastings = np.array([photo.easting for photo in map_.photos], dtype=np.float64)
     northings = np.array([photo.northing for photo in map_.photos], dtype=np.float64)
-    positions, step, cell = np.stack([eastings, northings], axis=1), motion.typical_speed_mps, 1.0
     if np.isnan(eastings).any():
-        positions, step = np.arange(len(map_.photos), dtype=np.float64)[:, None], 1.0
-        reach = HMM_FRAMES
-    else:
-        cell, reach = SEQSLAM_CELL_M, motion.max_speed_mps
-    return {
-        "seqslam": seqslam_matches(scores, positions, step, cell),
-        "hmm": hmm_matches(scores, positions, reach),
-    }
+        line = np.arange(len(map_.photos), dtype=np.float64)[:, None]
+        return seqslam_matches(scores, line, 1.0, 1.0)
+    positions = np.stack([eastings, northings], axis=1)
+    return seqslam_matches(scores, positions, motion.typical_speed_mps, SEQSLAM_CELL_M)
 
 
 def _photo(photo: str | None) -> int:
@@ -365,7 +355,7 @@ def sequence_figures(sequences: Sequence[Sequence[FrameResult]]) -> dict[str, An
         "frames_outside": len(frames) - len(inside),
         "recall": {
             name: _share([getattr(frame, f"{name}_is_right") for frame in inside])
-            for name in ("single", "seqslam", "hmm", "filter", "smoothed")
+            for name in ("single", "seqslam", "filter", "smoothed")
         },
         "recall_at_99_precision": {
             name: recall_at_precision(

@@ -15,7 +15,7 @@ from uuid import UUID
 import numpy as np
 import typer
 
-from placewise.answers import Estimate, Photo
+from placewise.answers import Photo
 from placewise.client import Client
 from services.cli.client import active_generation, connect
 from services.cli.output import (
@@ -239,10 +239,6 @@ def _check_unique_names(photos: list[Photo], names: PairNames) -> None:
 @app.command("geojson")
 def geojson(
     out: Annotated[Path, typer.Option(metavar="FILE.geojson", help="Output file.")],
-    estimates: Annotated[
-        bool,
-        typer.Option(help="Also search with each labelled query and export its estimated place."),
-    ] = False,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
@@ -253,8 +249,7 @@ def geojson(
     Coordinates are WGS 84, longitude first. A photo without coordinates has a null geometry.
     """
     check_output_path(out, ".geojson", "a GeoJSON export")
-    photos = skipped = 0
-    queries: list[Photo] = []
+    photos = 0
     with (
         connect(server, map_name, key) as client,
         progress_bar() as progress,
@@ -265,28 +260,10 @@ def geojson(
         features = _FeatureWriter(file)
         for photo in progress.track(client.photos(), total=total, description="photos"):
             properties = photo.model_dump(mode="json", include=PHOTO_PROPERTIES)
-            features.add(str(photo.image_id), photo, {"kind": "photo", **properties})
+            features.add(photo, properties)
             photos += 1
-            if estimates and photo.role == "query":
-                queries.append(photo)
-        for photo in progress.track(queries, description="querying"):
-            try:
-                estimate = client.similar(photo, history=False).estimate
-            except Conflict as error:
-                if error.code != "not_searchable":
-                    raise
-                skipped += 1
-                continue
-            query = str(photo.image_id)
-            properties = {"kind": "estimate", "query": query, **estimate.as_json()}
-            features.add(f"{query}#estimate", estimate, properties)
         features.end()
-    found = len(queries) - skipped
-    print_result(
-        {"file": str(out), "photos": photos, "estimates": found, "skipped": skipped},
-        as_json,
-        f"{out}: {photos} photos, {found} estimates.",
-    )
+    print_result({"file": str(out), "photos": photos}, as_json, f"{out}: {photos} photos.")
 
 
 class _FeatureWriter:
@@ -297,14 +274,14 @@ class _FeatureWriter:
         self._separator = b"\n"
         file.write(b'{"type": "FeatureCollection", "features": [')
 
-    def add(self, feature_id: str, position: Photo | Estimate, properties: Json) -> None:
+    def add(self, photo: Photo, properties: Json) -> None:
         geometry: dict[str, Any] | None = None
-        if position.latitude is not None:
-            coordinates = [position.longitude, position.latitude]
+        if photo.latitude is not None:
+            coordinates = [photo.longitude, photo.latitude]
             geometry = {"type": "Point", "coordinates": coordinates}
         feature = {
             "type": "Feature",
-            "id": feature_id,
+            "id": str(photo.image_id),
             "geometry": geometry,
             "properties": properties,
         }

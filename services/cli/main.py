@@ -30,6 +30,7 @@ PANELS = {
         "query": "services.cli.query:query",
         "track": "services.cli.track.command:track",
         "locate": "services.cli.locate.command:locate",
+        "immich": "services.cli.immich.command:immich",
         "reconstruct": "services.cli.reconstruct:reconstruct",
         "export": "services.cli.export:app",
         "maps": "services.cli.maps:app",

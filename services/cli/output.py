@@ -11,7 +11,7 @@ import os
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from operator import methodcaller
@@ -48,6 +48,11 @@ _REPLACED_IN_LINES = {code: text for code, text in _REPLACED.items() if chr(code
 def printable_text(text: str) -> str:
     """Return a name on one line: control characters, such as escape sequences, are replaced."""
     return text.translate(_REPLACED)
+
+
+def first_names(names: Sequence[str], most: int = 3) -> str:
+    """Join the first names for a message; dots stand for the others."""
+    return ", ".join(names[:most]) + " ..." * (len(names) > most)
 
 
 class _PrintableConsole(Console):

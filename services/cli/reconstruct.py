@@ -9,6 +9,7 @@ from typing import Annotated
 from uuid import UUID
 
 import typer
+from pydantic import TypeAdapter, ValidationError
 from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Column
@@ -25,6 +26,7 @@ from services.cli.output import (
     MapOption,
     ServerOption,
     Table,
+    first_names,
     format_percent,
     print_failures,
     print_json,
@@ -34,7 +36,7 @@ from services.cli.output import (
     progress_bar,
 )
 from shared.errors import Conflict, InvalidRequest
-from shared.geometry.colmap_model import ColmapModel, read_colmap_model
+from shared.geometry.colmap_model import ColmapModel, Origin, read_colmap_model
 
 MAX_NAMES_SHOWN = 5
 NAMES_MEANING = {
@@ -72,6 +74,14 @@ def reconstruct(
             help="With --import: upload the photos of this folder first.",
         ),
     ] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LAT,LON,ALT",
+            help="With --import: where the model's zero is, if its axes are east, north and up in "
+            "metres. Without it, the model is aligned to the coordinates of its photos.",
+        ),
+    ] = None,
     from_scratch: Annotated[
         bool,
         typer.Option(
@@ -96,14 +106,17 @@ def reconstruct(
     Photos that show the same are reconstructed together and aligned to their coordinates. A later
     run adds the photos that are new. Interrupted, it goes on from its last step.
     """
-    options = {"--import": model, "--images": images, "--from-scratch": from_scratch}
-    given = [name for name, value in options.items() if value]
-    if (images and not model) or (proposals and given) or (model and from_scratch):
+    with_import, given = images or origin, model or from_scratch
+    if (with_import and not model) or (proposals and given) or (model and from_scratch):
         raise InvalidRequest(
             "options_contradict",
-            "--images goes with --import; --from-scratch and --proposals go with no other option.",
+            "--images and --origin go with --import; --from-scratch and --proposals go with no "
+            "other option.",
         )
+    place = None if origin is None else _parse_origin(origin)
     poses = read_colmap_model(model) if model else None  # fails before anything is uploaded
+    if poses is not None and place is not None:
+        poses = poses.model_copy(update={"origin": place})
     if model and (model / "images.bin").exists() and (model / "images.txt").exists():
         print_note(f"{model} has text files, too. As COLMAP does, the binary files are read.")
     with ExitStack() as stack:
@@ -127,6 +140,17 @@ def reconstruct(
         options_shown = ("reconstruct", "--proposals", "list")
         command = client_command(*options_shown, server=server, map_name=map_name)
         print_note(f"The coordinates of {made.proposals} photos disagree with it: {command}")
+
+
+def _parse_origin(text: str) -> Origin:
+    try:
+        return TypeAdapter(Origin).validate_python(tuple(text.split(",")))
+    except ValidationError as error:
+        raise InvalidRequest(
+            "bad_origin",
+            f"--origin {text!r:.50} is no latitude, longitude and altitude: send degrees, degrees "
+            "and metres, such as 45.0693,7.6853,241.5.",
+        ) from error
 
 
 def _start(client: Client, poses: ColmapModel | None, from_scratch: bool) -> UUID:
@@ -168,12 +192,14 @@ def _print_reconstruction(made: Reconstruction, result: Json) -> None:
     )
     for what, meaning in NAMES_MEANING.items():
         if names := result.get(f"{what}_names"):
-            shown = ", ".join(names[:MAX_NAMES_SHOWN]) + " ..." * (len(names) > MAX_NAMES_SHOWN)
+            shown = first_names(names, MAX_NAMES_SHOWN)
             why = meaning if made.imported else "photos are in no component"
             print_note(f"{result[what]} {why}: {shown}")
 
 
 def _format_alignment(component: Component) -> str:
+    if not component.located:
+        return "at the given origin"
     text = (
         f"{component.alignment_rms_m:.2f} m from the coordinates of {component.agreeing} of "
         f"{component.located} photos"

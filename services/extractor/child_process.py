@@ -71,7 +71,7 @@ def run_in_child(
 
 
 def _run(sender: Connection, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    exit_with_parent()
     os.nice(NICENESS)
 
     def report(*progress: Any) -> None:
@@ -84,8 +84,13 @@ def _run(sender: Connection, function: Callable[..., Any], args: tuple[Any, ...]
         sender.send(("error", error))
 
 
-def _exit_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
+def exit_with_parent() -> None:
+    """End this process, at once and wherever it is, when the one that has started it ends."""
+
+    def wait() -> None:
+        parent = multiprocessing.parent_process()
+        assert parent is not None
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()

@@ -24,7 +24,7 @@ from shared.catalog.database.base import (
     json_array_has,
     json_array_has_part,
 )
-from shared.catalog.photos import Photo, PhotoRole, is_geotagged
+from shared.catalog.photos import Photo, PhotoRole, has_given_place, is_geotagged, is_removed
 from shared.place_paths import PATH_SEPARATOR
 from shared.search_api.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
 
@@ -49,6 +49,14 @@ class MetadataFilter:
     role: PhotoRole | None = None
     failed: bool = False
     """Whether the photo's description has to have failed."""
+    without_place: bool = False
+    """Whether the photo must have neither coordinates nor a label."""
+    place_given: bool = False
+    """Whether the photo's place must have been given here."""
+    removed: bool = False
+    """Whether the photo must be in the trash, instead of live."""
+    by_capture: bool = False
+    """Whether photos are sorted by when they were taken, and have to be dated."""
 
     def conditions(self, photo: type[Photo] = Photo, *, trigrams: bool) -> list[Condition]:
         """Return the SQL conditions; `trigrams` if the catalog has a trigram index (PostgreSQL)."""
@@ -71,6 +79,10 @@ class MetadataFilter:
             conditions.append(photo.size_bytes <= self.max_file_size)
         if self.role is not None:
             conditions.append(photo.role == self.role)
+        if self.without_place:
+            conditions.append(~is_geotagged(photo))
+        if self.place_given:
+            conditions.append(has_given_place(photo))
         return conditions + filter_conditions(self.photos, photo)
 
 
@@ -110,23 +122,27 @@ def search_photos(
     limit: int,
     after: tuple[datetime, UUID] | None,
 ) -> tuple[list[Photo], int]:
-    """Search the live photos of a map, newest first.
+    """Search the live photos of a map, or those in its trash, newest first.
 
     Args:
-        after: Cursor: upload time and id of the last photo of the previous page.
+        after: Cursor: upload time (or capture time) and id of the last photo of the previous page.
 
     Returns:
         A page of photos, and the total number of matches, counted up to MAX_COUNTED_MATCHES.
     """
     on_postgres = session.get_bind().dialect.name == "postgresql"
-    live = [Photo.map_id == map_id, Photo.deleted_at.is_(None)]
+    is_there = is_removed() if metadata_filter.removed else Photo.deleted_at.is_(None)
+    live = [Photo.map_id == map_id, is_there]
     if metadata_filter.failed:
         live.append(Photo.id.in_(select_failed_photos(map_id)))
+    if metadata_filter.by_capture:
+        live.append(Photo.captured_at.is_not(None))
     conditions = [*live, *metadata_filter.conditions(trigrams=on_postgres)]
     total = count_rows(session, select(Photo.id).where(*conditions), MAX_COUNTED_MATCHES)
-    newest = (Photo.uploaded_at.desc(), Photo.id.desc())
+    time = Photo.captured_at if metadata_filter.by_capture else Photo.uploaded_at
+    newest = (time.desc(), Photo.id.desc())
     if after is not None:
-        live.append(tuple_(Photo.uploaded_at, Photo.id) < tuple_(*_cursor_bound(after)))
+        live.append(tuple_(time, Photo.id) < tuple_(*_cursor_bound(after)))
     page: Select[Photo]
     if total < MAX_COUNTED_MATCHES:
         rare = select(Photo.id).where(*conditions).cte("rare")
@@ -138,7 +154,7 @@ def search_photos(
         newest_first = select(Photo).where(*live).order_by(*newest).offset(0).subquery()
         scanned = aliased(Photo, newest_first)
         page = select(scanned).where(*metadata_filter.conditions(scanned, trigrams=False))
-        page = page.order_by(scanned.uploaded_at.desc(), scanned.id.desc())
+        page = page.order_by(getattr(scanned, time.key).desc(), scanned.id.desc())
     return list(session.scalars(page.limit(limit))), total
 
 

@@ -17,7 +17,7 @@ from shared.catalog.photos import Photo
 from shared.jobs import Job, JobKind, JobState
 from shared.responses import ResponseModel
 from shared.responses.jobs import JobAccepted, JobFields, JobProgress
-from shared.responses.similarity import PhotoResponse
+from shared.responses.similarity import GivenPlace, PhotoResponse
 
 P = TypeVar("P", bound=PhotoResponse)
 
@@ -34,6 +34,9 @@ def photo_response(kind: type[P], photo: Photo, map_name: str, **values: Any) ->
         image_url=image,
         thumbnail_url=thumbnail,
         preview_url=preview,
+        given_place=GivenPlace.model_validate(photo.given_place)
+        if photo.given_place and photo.place_is_as_given
+        else None,
         **values,
     )
 

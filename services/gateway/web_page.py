@@ -2,7 +2,7 @@
 
 All assets come from this server: Leaflet, Swagger UI and ReDoc are files of installed packages. The
 only other origin that a page may load from is that of MAP_TILES: images, and only once the user has
-agreed.
+agreed, or the operator by setting it.
 """
 
 from __future__ import annotations
@@ -100,6 +100,7 @@ def _page_settings(settings: Settings, lan_url: str | None) -> dict[str, Any]:
     """Settings of the page. Served without a key: must not expose stored data."""
     return {
         "map_tiles": settings.map_tiles,
+        "map_tiles_are_chosen": "map_tiles" in settings.model_fields_set,
         "map_attribution": settings.tile_attribution,
         "max_file_size": settings.max_file_size,
         "lan_url": lan_url,

@@ -48,6 +48,8 @@ class GeotaggedPhoto:
     captured_at: datetime | None
     name: str
     """its path in its folder, else its file name"""
+    place_is_estimated: bool = False
+    """whether its place is an accepted proposal"""
     _name_parts: list[str] = field(init=False, compare=False)
     """text and digits of the name in turn"""
 
@@ -121,6 +123,7 @@ def read_geotagged_photos(
             Photo.place,
             Photo.captured_at,
             sql.func.coalesce(Photo.relative_path, Photo.filename),
+            Photo.given_place,
         )
         .join(Descriptor, Descriptor.photo_id == Photo.id)
         .where(
@@ -132,7 +135,16 @@ def read_geotagged_photos(
         )
         .order_by(Photo.id)
     )
-    return [GeotaggedPhoto(row[0], PhotoLocation(*row[1:4]), *row[4:]) for row in photos]
+    return [
+        GeotaggedPhoto(
+            row[0],
+            PhotoLocation(*row[1:4]),
+            row[4],
+            row[5],
+            place_is_estimated=bool(row[6]) and row[6]["probability"] is not None,
+        )
+        for row in photos
+    ]
 
 
 MAX_READ_ATTEMPTS = 2

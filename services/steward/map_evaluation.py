@@ -241,8 +241,12 @@ class MapEvaluation:
         self.search = EvaluationSearch(catalog, search, generation, version, self._by_id)
 
     def draw_sample(self, size: int, seed: int) -> list[GeotaggedPhoto]:
-        """Draw at most `size` database photos as leave-one-out queries, reproducible by `seed`."""
-        return _draw(self.database.photos, size, seed)
+        """Draw at most `size` database photos as leave-one-out queries, reproducible by `seed`.
+
+        Not those whose place is an accepted proposal: it would measure the map by its own answers.
+        """
+        known = [photo for photo in self.database.photos if not photo.place_is_estimated]
+        return _draw(known, size, seed)
 
     def evaluate(self, sample: Sequence[GeotaggedPhoto]) -> MapEvaluationResult:
         """Search with every photo of the sample and every labelled query, and compute the metrics.

@@ -15,6 +15,7 @@ from prometheus_client import CollectorRegistry
 from sqlalchemy.exc import SQLAlchemyError
 
 import services.steward.batches.worker
+import services.steward.library_sync
 import services.steward.tasks.auto_evaluation
 import services.steward.tasks.auto_fit
 import services.steward.tasks.compaction

@@ -18,6 +18,7 @@ from services.service_process import (
 )
 from services.steward.batches.worker import BatchWorker
 from services.steward.evaluation_worker import EvaluationWorker
+from services.steward.library_sync import LibrarySyncWorker
 from services.steward.metrics import StewardMetrics
 from services.steward.scheduler import Scheduler
 from services.steward.webhooks import WebhookDispatcher
@@ -51,10 +52,12 @@ def serve_steward(settings: Settings, announce: Announce) -> None:
         batches = BatchWorker(catalog, store, wakeups, settings, name, metrics)
         scheduler = Scheduler(catalog, store, wakeups, settings, metrics)
         evaluator = EvaluationWorker(catalog, search, settings, name, metrics)
+        libraries = LibrarySyncWorker(catalog, settings, name, metrics)
         webhooks = WebhookDispatcher(catalog, settings)
         threads = start_service_threads(
             {
                 "evaluator": evaluator.run,
+                "libraries": libraries.run,
                 "batches": batches.run,
                 "webhooks": webhooks.run,
                 "steward": scheduler.run,

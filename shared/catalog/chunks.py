@@ -17,7 +17,7 @@ from sqlalchemy.orm import Mapped, Session, mapped_column
 from shared.catalog.database.base import Base, UtcDateTime, count_rows, db_now, partial_index
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import Job, JobState
-from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole, is_geotagged
+from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole, is_geotagged, is_kept
 from shared.ids import new_id
 from shared.storage.chunks import features_key
 
@@ -188,7 +188,7 @@ def list_live_chunks(session: Session, generation_id: UUID) -> list[Chunk]:
 
 
 def list_live_rows(session: Session, chunk_id: UUID) -> list[tuple[int, UUID]]:
-    """List (row, photo id) of the chunk's rows that belong to live photos, by row."""
+    """List (row, photo id) of the chunk's rows of live photos and of those in the trash, by row."""
     return [(row, values.photo_id) for row, values in list_live_filter_values(session, chunk_id)]
 
 
@@ -201,11 +201,14 @@ def delete_chunk_rows(session: Session, chunk_id: UUID) -> None:
 def list_live_filter_values(
     session: Session, chunk_id: UUID
 ) -> list[tuple[int, PhotoFilterValues]]:
-    """List (row, filter values of its photo) of the chunk's live rows, by row."""
+    """List (row, filter values of its photo) of the chunk's live rows, by row.
+
+    Also of those of photos in the trash, which no search returns until they are restored.
+    """
     rows = session.execute(
         sa.select(Descriptor.row, *PhotoFilterValues.COLUMNS)
         .join(Photo, Photo.id == Descriptor.photo_id)
-        .where(Descriptor.chunk_id == chunk_id, Photo.deleted_at.is_(None))
+        .where(Descriptor.chunk_id == chunk_id, is_kept())
         .order_by(Descriptor.row)
     )
     return [(row[0], PhotoFilterValues(*row[1:])) for row in rows]

@@ -109,8 +109,7 @@ def check_not_behind(catalog: Catalog, store: ObjectStore) -> list[Segment]:
             f"{since:%Y-%m-%d %H:%M:%S} UTC that it lacks. Nothing was changed. Restore the newer "
             "catalog; or create it from the object store: stop all services, let DATABASE_URL name "
             "an empty database (or move catalog.sqlite and its -wal and -shm files away), and run "
-            "`placewise storage rebuild`. To continue without those changes: `placewise storage "
-            "adopt`.",
+            "`placewise storage rebuild`.",
         )
     return segments
 

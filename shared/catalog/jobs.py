@@ -66,6 +66,7 @@ class JobKind(StrEnum):
     ADD_MODEL = "add_model"  # check a checkpoint and register it as a model, for any map
     EVALUATE = "evaluate"  # search the map with photos whose place is known; compute recall
     RECONSTRUCT = "reconstruct"  # reconstruct the map's photos (`shared.catalog.reconstructions`)
+    SYNC_LIBRARY = "sync_library"  # bring the map up to date with a photo library
     BATCH = "batch"  # import many photos, each with its own job (`shared.catalog.batch_items`)
 
 
@@ -101,6 +102,7 @@ JOB_TYPES = {
     JobKind.ADD_MODEL: JobType("New model", has_upload=True),
     JobKind.EVALUATE: JobType("Evaluation", RunBy.STEWARD),
     JobKind.RECONSTRUCT: JobType("Reconstruction", RunBy.FIT_WORKER, has_upload=True),
+    JobKind.SYNC_LIBRARY: JobType("Photo library", RunBy.STEWARD),
     JobKind.BATCH: JobType("Batch", RunBy.STEWARD, in_slices=True),
 }
 
@@ -112,7 +114,6 @@ def _kinds(condition: Callable[[JobType], bool]) -> tuple[JobKind, ...]:
 DRAINED_JOBS = _kinds(lambda kind: kind.run_by == RunBy.EXTRACTOR)
 FIT_WORKER_JOBS = _kinds(lambda kind: kind.run_by == RunBy.FIT_WORKER)
 EXTRACTOR_JOBS = DRAINED_JOBS + FIT_WORKER_JOBS
-STEWARD_JOBS = _kinds(lambda kind: kind.run_by == RunBy.STEWARD)
 SINGLE_CLAIM_JOBS = _kinds(lambda kind: kind.run_by != RunBy.STEWARD and not kind.in_batches)
 MODEL_CHANGE_JOBS = _kinds(lambda kind: kind.changes_model)
 CHECKPOINTED_JOBS = _kinds(lambda kind: kind.changes_model or kind.in_slices)

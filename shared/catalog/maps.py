@@ -280,6 +280,24 @@ def list_searches(
     return list_newest(session, Search, Search.map_id == map_id, limit=limit, before=before)
 
 
+RECENT_SEARCHES = 100
+
+
+def recent_best_scores(session: Session, map_id: UUID, generation_id: UUID) -> list[float]:
+    """Return the best scores of those of the last RECENT_SEARCHES that searched a generation."""
+    recent = (
+        sa.select(Search.best_score, Search.generation_id)
+        .where(Search.map_id == map_id)
+        .order_by(Search.id.desc())
+        .limit(RECENT_SEARCHES)
+    )
+    return [
+        score
+        for score, generation in session.execute(recent)
+        if score is not None and generation == generation_id
+    ]
+
+
 MIN_STATISTICS_AGE_SECONDS = 30.0
 # Counting a large map takes at most 1/50 of the time: the pause is at least 50 times the duration.
 RECOUNT_REST_FACTOR = 50.0

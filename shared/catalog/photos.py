@@ -25,6 +25,7 @@ from shared.catalog.database.base import (
     UtcDateTime,
     count_rows,
     db_now,
+    db_now_plus,
     filename_trigrams,
     json_array_has_part,
     partial_index,
@@ -43,7 +44,8 @@ class Photo(Journaled, Base):
     `job_id` is the job that describes the photo; the photo is searchable if it has a row in
     `descriptors`. `altitude` is in metres, above the sea where its source says so; `focal_length`
     is a multiple of the longer side. `changed_version` is the map's version at the last change that
-    affects searches.
+    affects searches. `given_place` is the journal of a place that the photo was given here: the
+    `former` and the `written` values by column, `probability`, `reason` and `given_at`.
     """
 
     __tablename__ = "photos"
@@ -69,11 +71,14 @@ class Photo(Journaled, Base):
     heading: Mapped[float | None] = mapped_column(sa.Float)
     focal_length: Mapped[float | None] = mapped_column(sa.Float)
     captured_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    capture: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)  # of `describe_capture`
     place: Mapped[str | None] = mapped_column(sa.Text)
     tags: Mapped[list[str]] = mapped_column(JsonValue, default=list)
     attributes: Mapped[dict[str, Any]] = mapped_column("metadata", JsonValue, default=dict)
+    given_place: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
     uploaded_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    purge_at: Mapped[datetime | None] = mapped_column(UtcDateTime)  # deleted: its objects go then
     changed_version: Mapped[int] = mapped_column(sa.BigInteger, default=0)
     key_id: Mapped[UUID | None] = mapped_column(sa.Uuid)  # the API key of the upload, if any
 
@@ -145,6 +150,12 @@ class Photo(Journaled, Base):
         partial_index("ix_photos_deleted", "deleted_at", only=deleted_at.is_not(None)),
     )
 
+    @property
+    def place_is_as_given(self) -> bool:
+        """Whether the photo has the place that it was given, and not another one since."""
+        written = self.given_place["written"] if self.given_place else {}
+        return all(getattr(self, name) == value for name, value in written.items())
+
 
 @dataclass(frozen=True, slots=True)
 class PhotoFilterValues:
@@ -176,12 +187,11 @@ class PhotoFilterValues:
         return self.deleted_at is None and self.role == PhotoRole.DATABASE
 
 
-def get_photo(session: Session, map_id: UUID, photo_id: UUID) -> Photo:
-    """Return a live photo of the map; NotFound (`photo_not_found`)."""
+def get_photo(session: Session, map_id: UUID, photo_id: UUID, *, or_removed: bool = False) -> Photo:
+    """Return a live photo of the map, or also one in the trash; NotFound (`photo_not_found`)."""
+    is_there = is_kept() if or_removed else Photo.deleted_at.is_(None)
     photo = session.scalar(
-        sa.select(Photo).where(
-            Photo.id == photo_id, Photo.map_id == map_id, Photo.deleted_at.is_(None)
-        )
+        sa.select(Photo).where(Photo.id == photo_id, Photo.map_id == map_id, is_there)
     )
     if photo is None:
         raise NotFound(
@@ -250,17 +260,40 @@ def has_live_photo(session: Session, map_id: UUID, role: PhotoRole) -> bool:
     return session.scalar(select_live_photos(map_id, role).limit(1)) is not None
 
 
+def has_given_place(photo: type[Photo] = Photo) -> Condition:
+    """Condition for photos whose place was given here, not sent with them."""
+    return photo.given_place.is_not(None)
+
+
 def is_geotagged(photo: type[Photo] = Photo) -> Condition:
     """Condition for photos with coordinates or a place label."""
     return sa.or_(photo.latitude.is_not(None), photo.place.is_not(None))
 
 
-def mark_photo_deleted(session: Session, photo: Photo, version: int) -> None:
-    """Hide the photo from all responses from this commit on; its objects are deleted later."""
+def is_removed() -> Condition:
+    """Condition for deleted photos whose objects are kept for now: the trash."""
+    return sa.and_(Photo.deleted_at.is_not(None), Photo.purge_at > db_now())
+
+
+def is_kept() -> Condition:
+    """Condition for live photos and those in the trash."""
+    return sa.or_(Photo.deleted_at.is_(None), is_removed())
+
+
+def mark_photo_deleted(
+    session: Session, photo: Photo, version: int, kept_days: float = 0.0
+) -> None:
+    """Hide the photo from all responses from this commit on; its objects are deleted later.
+
+    Args:
+        kept_days: How long the photo stays in the trash.
+    """
     session.execute(
         sa.update(Photo)
         .where(Photo.id == photo.id)
-        .values(deleted_at=db_now(), changed_version=version)
+        .values(
+            deleted_at=db_now(), purge_at=db_now_plus(kept_days * 86_400), changed_version=version
+        )
     )
 
 

@@ -86,8 +86,8 @@ class GatewaySettings(BaseSettings):
 
     map_tiles: str | None = Field(
         OPENSTREETMAP_TILES,
-        description="URL template of the streets in the web page's maps, which a browser loads "
-        "once its user has agreed; `off`: the maps have a coordinate grid only",
+        description="URL template of the streets in the web page's maps; if it is set, browsers "
+        "load them at once, otherwise when their user has agreed; `off`: a coordinate grid only",
     )
     map_attribution: str | None = Field(
         None,

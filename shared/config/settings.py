@@ -58,8 +58,7 @@ class ServiceSettings(BaseSettings):
     port: int = Field(8000, ge=0, le=65535, description="listening port; 0 picks a free port")
     debug: bool = Field(
         False,
-        description="log every request and every rejected request, and restart the embedded server "
-        "of a checkout when its code changes; responses stay the same",
+        description="log every request and every rejected request; responses stay the same",
     )
     log_format: Literal["text", "json"] = Field(
         "text", description="log format; json writes one JSON object per line"
@@ -84,7 +83,7 @@ class ServiceSettings(BaseSettings):
     redis_url: SecretStr | None = Field(
         None,
         description="URL of the Redis that carries job notifications between services; unset: all "
-        "services run in one process",
+        "services run as one server",
     )
     heartbeat_file: Path | None = Field(
         None,

@@ -68,6 +68,12 @@ class StorageSettings(BaseSettings):
         "nearly full",
     )
 
+    removed_photo_days: float = Field(
+        30.0,
+        ge=0,
+        description="days in which a photo that was deleted can be restored; its bytes are kept",
+    )
+
     @field_validator("placewise_home", "upload_dir")
     @classmethod
     def _resolve_path(cls, value: Path | None) -> Path | None:

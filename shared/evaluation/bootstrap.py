@@ -3,7 +3,9 @@
 Queries of one street or one drive are correlated; treating them as independent would make intervals
 too narrow. The bootstrap therefore resamples whole clusters with replacement, as many as there are,
 and averages over their queries (cluster bootstrap, Davison and Hinkley 1997, 3.8; percentile
-intervals).
+intervals). Where every query has the same outcome, 0 or 1, every resample has it, too, and the
+percentiles would claim certainty. A share of 0 or 100 % has Wilson's score interval instead
+(Wilson 1927), with the clusters as observations: 0 to z^2 / (n + z^2), or n / (n + z^2) to 1.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 
 RESAMPLES = 2000
 CONFIDENCE_LEVEL = 0.95
+CONFIDENCE_Z = 1.959964  # quantile of the normal distribution at 0.975
 MIN_CLUSTERS = 5  # resampling fewer clusters says too little about unseen ones
 MAX_COUNTS_PER_BLOCK = 4_000_000  # bounds the memory of the resampled counts
 
@@ -23,7 +26,7 @@ Values = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class ConfidenceInterval:
-    """Percentile interval at `CONFIDENCE_LEVEL`."""
+    """Interval at `CONFIDENCE_LEVEL`."""
 
     low: float
     high: float
@@ -34,6 +37,23 @@ class ConfidenceInterval:
     def as_percent(self) -> str:
         """Return the bounds in per cent: `41.2 to 57.0`."""
         return f"{100 * self.low:.1f} to {100 * self.high:.1f}"
+
+
+def share_intervals(values: Values, clusters: NDArray[np.int64]) -> list[ConfidenceInterval] | None:
+    """Compute intervals as `bootstrap_intervals` does, of shares: values from 0 to 1.
+
+    Those of 0 and 100 % are Wilson's.
+    """
+    intervals = bootstrap_intervals(values, clusters)
+    if intervals is None:
+        return None
+    count, square = len(np.unique(clusters)), CONFIDENCE_Z**2
+    none = ConfidenceInterval(0.0, square / (count + square))
+    every = ConfidenceInterval(count / (count + square), 1.0)
+    return [
+        none if not column.any() else every if (column == 1).all() else interval
+        for column, interval in zip(values.T, intervals, strict=True)
+    ]
 
 
 def bootstrap_intervals(

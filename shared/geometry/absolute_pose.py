@@ -7,7 +7,7 @@ covariance, so the last steps are done here, in NumPy.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import poselib
@@ -32,6 +32,11 @@ FOCAL_TIE_SHARE = 0.9
 ITERATIONS = 25
 UNKNOWN_FOCAL_SIGMA = 10.0
 """ln: no knowledge at all"""
+PRINCIPAL_POINT_SIGMA = 0.0025
+"""of the longer side, in each direction, around the middle of the photo"""
+RADIAL_SIGMA = 0.02
+PARAMETERS = 10
+"""Centre, turn, ln(focal length), principal point and radial distortion"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +62,8 @@ def estimate_absolute_pose(
     camera: Camera,
     focal_sigma: float | None,
     covariances: Floats | None = None,
+    *,
+    is_lens_known: bool = False,
 ) -> AbsolutePose | None:
     """Return the pose that most pairs agree with; None if there is none.
 
@@ -66,6 +73,8 @@ def estimate_absolute_pose(
         camera: of the photo. Its focal length is ignored if `focal_sigma` is None.
         focal_sigma: relative standard deviation of the focal length; None if it is unknown.
         covariances: (m, 3, 3) of the points, for keypoints of one pixel at WORKING_SIDE.
+        is_lens_known: Whether principal point and distortion are exactly those of `camera`.
+            Otherwise they are estimated, too, and their errors are in the covariance.
     """
     if len(pixels) < MIN_PAIRS:
         return None
@@ -83,13 +92,16 @@ def estimate_absolute_pose(
             position = -found.R.T @ found.t
             fits.append(_Fit(pixels, points, covariances, tried, found.R, position))
     refined = sorted(fits, key=lambda fit: fit.cost)[:REFINED_STARTS]
+    lens_sigmas = [PRINCIPAL_POINT_SIGMA * WORKING_SIDE] * 2 + [RADIAL_SIGMA]
+    lens_weights = [0.0] * 3 if is_lens_known else [sigma**-2 for sigma in lens_sigmas]
+    weights = np.array([0.0] * 6 + [_prior(focal_sigma), *lens_weights])
     for fit in refined:
-        fit.refine(focal_sigma)
+        fit.refine(weights)
     best = min(refined, key=lambda fit: fit.cost, default=None)
     if best is None or best.is_inlier.sum() < MIN_PAIRS:
         return None
     enough = FOCAL_TIE_SHARE * best.is_inlier.sum()
-    return best.pose(focal_sigma, [fit for fit in refined if fit.is_inlier.sum() >= enough])
+    return best.pose(weights, [fit for fit in refined if fit.is_inlier.sum() >= enough])
 
 
 class _Fit:
@@ -108,6 +120,7 @@ class _Fit:
         self.unit = max(camera.width, camera.height) / WORKING_SIDE
         self.camera, self.rotation, self.position = camera, rotation, position
         self.start = camera
+        self.shift = np.zeros(2)
         self._measure()
 
     def _measure(self) -> None:
@@ -117,53 +130,63 @@ class _Fit:
         self.offsets = offsets
         in_front = self.seen[:, 2] > 0
         self.seen[~in_front, 2] = np.inf
-        self.errors = (self.pixels - self.camera.project(self.seen)) / self.unit
+        self.errors = (self.pixels - self.camera.project(self.seen)) / self.unit - self.shift
         squares = np.where(in_front, np.sum(self.errors**2, axis=1), np.inf)
-        self.cost = float(np.minimum(squares, MAX_ERROR_PIXELS**2).sum())
+        # Cauchy's loss tells apart poses of as many inliers by those that agree closely.
+        bounded = np.minimum(squares, MAX_ERROR_PIXELS**2)
+        self.cost = float(np.log1p(bounded / LOSS_SCALE_PIXELS**2).sum())
         self.is_inlier: NDArray[np.bool_] = squares < MAX_ERROR_PIXELS**2
 
-    def refine(self, focal_sigma: float | None) -> None:
-        """Refine by damped Gauss-Newton steps that are weighted as Cauchy's loss does."""
-        prior = _prior(focal_sigma)
+    def refine(self, priors: Floats) -> None:
+        """Refine by damped Gauss-Newton steps that are weighted as Cauchy's loss does.
+
+        Args:
+            priors: (PARAMETERS,) weights of the prior values; the lens stays as it is with 0.
+        """
         damping = 1e-3
         for _ in range(ITERATIONS):
-            rows, errors, weights = self._linearise()
+            rows, errors, weights = self._linearise(priors)
             weighted = rows * weights[:, None, None]
             normal = np.einsum("mik,mil->kl", weighted, rows)
             gradient = np.einsum("mik,mi->k", weighted, errors)
-            normal[6, 6] += prior
-            gradient[6] -= prior * np.log(self.camera.focal_pixels / self.start.focal_pixels)
-            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
-            before = self.rotation, self.position, self.camera, self.cost
+            normal += np.diag(priors)
+            off = np.log(self.camera.focal_pixels / self.start.focal_pixels)
+            gradient[6] -= priors[6] * off
+            gradient[7:9] -= priors[7:9] * self.shift
+            gradient[9] -= priors[9] * (self.camera.radial - self.start.radial)
+            damped = normal + np.diag(damping * np.diag(normal) + (priors == 0) * 1e-9)
+            step = np.linalg.solve(damped, gradient)
+            before = self.rotation, self.position, self.camera, self.shift, self.cost
             self.position = self.position + step[:3]
             self.rotation = self.rotation @ rotation_of_vector(-step[3:6])
             focal = self.camera.focal_length * float(np.exp(np.clip(step[6], -0.3, 0.3)))
-            self.camera = self.camera.with_focal_length(
-                float(np.clip(focal, MIN_FOCAL_LENGTH, MAX_FOCAL_LENGTH))
-            )
+            focal = float(np.clip(focal, MIN_FOCAL_LENGTH, MAX_FOCAL_LENGTH))
+            radial = self.camera.radial + float(step[9])
+            self.camera = replace(self.camera.with_focal_length(focal), radial=radial)
+            self.shift = self.shift + step[7:9]
             self._measure()
-            if self.cost > before[3] * (1 + 1e-9):
-                self.rotation, self.position, self.camera, _ = before
+            if self.cost > before[4] * (1 + 1e-9):
+                self.rotation, self.position, self.camera, self.shift, _ = before
                 self._measure()
                 damping *= 10
                 if damping > 1e3:
                     break
                 continue
             damping = max(damping / 10, 1e-9)
-            if before[3] - self.cost < 1e-6 * self.cost:
+            if before[4] - self.cost < 1e-6 * self.cost:
                 break
 
-    def pose(self, focal_sigma: float | None, others: Sequence[_Fit]) -> AbsolutePose:
+    def pose(self, priors: Floats, others: Sequence[_Fit]) -> AbsolutePose:
         """Return the pose; its covariance is that of the inliers, scaled by their errors'.
 
         The covariance reaches as far as the poses that are as likely: of flat scenes, several focal
         lengths explain the matches.
         """
-        rows, errors, _ = self._linearise()
+        rows, errors, _ = self._linearise(priors)
         count = len(errors)
-        variance = float(np.sum(errors**2)) / max(1, 2 * count - 7)
+        variance = float(np.sum(errors**2)) / max(1, 2 * count - PARAMETERS)
         normal = np.einsum("mik,mil->kl", rows, rows) / max(variance, 1e-6)
-        normal[6, 6] += _prior(focal_sigma)
+        normal += np.diag(priors)
         covariance = np.linalg.pinv(normal, hermitian=True)
         apart = [self._difference_from(other) for other in others]
         if apart:
@@ -179,16 +202,18 @@ class _Fit:
         )
 
     def _difference_from(self, other: _Fit) -> Floats:
-        """Return the (7,) difference of another fit as the covariance has it."""
+        """Return the (PARAMETERS,) difference of another fit as the covariance has it."""
         turn = other.rotation.T @ self.rotation
         vector = np.array(
             [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
         )
         focal = np.log(other.camera.focal_pixels / self.camera.focal_pixels)
-        return np.concatenate([other.position - self.position, vector / 2, [focal]])
+        radial = other.camera.radial - self.camera.radial
+        lens = [focal, *(other.shift - self.shift), radial]
+        return np.concatenate([other.position - self.position, vector / 2, lens])
 
-    def _linearise(self) -> tuple[Floats, Floats, Floats]:
-        """Return Jacobian (k, 2, 7), errors (k, 2) and weights (k,) of the inliers.
+    def _linearise(self, priors: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return Jacobian (k, 2, PARAMETERS), errors (k, 2) and weights (k,) of the inliers.
 
         In units of their standard deviations, if keypoints have one pixel at WORKING_SIDE.
         """
@@ -205,11 +230,14 @@ class _Fit:
         of_seen[:, 0, 0] = of_seen[:, 1, 1] = 1
         of_seen[:, :, 2] = -plane
         of_point = of_plane @ of_seen / seen[:, 2, None, None] @ self.rotation
-        rows = np.empty((len(seen), 2, 7))
+        rows = np.zeros((len(seen), 2, PARAMETERS))
         rows[:, :, :3] = -of_point
         # A turn t of the camera moves what it sees by -t x offset.
         rows[:, :, 3:6] = of_point @ cross_matrices(offsets)
         rows[:, :, 6] = focal * (1 + radial * square)[:, None] * plane
+        if priors[9]:
+            rows[:, 0, 7] = rows[:, 1, 8] = 1
+            rows[:, :, 9] = focal * square[:, None] * plane
         if self.covariances is not None:
             of_pixel = of_point @ self.covariances[self.is_inlier] @ of_point.transpose(0, 2, 1)
             whitening = np.linalg.inv(np.linalg.cholesky(of_pixel + np.eye(2)))

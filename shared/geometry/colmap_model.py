@@ -42,6 +42,9 @@ _IMAGE = struct.Struct("<I7dI")  # id, rotation w x y z, translation, camera
 _POINT_BYTES = 24  # of an image: x, y, number of the point
 
 Number = Annotated[float, Field(ge=-1e12, le=1e12)]
+Latitude = Annotated[float, Field(ge=-90, le=90)]
+Longitude = Annotated[float, Field(ge=-180, le=180)]
+Origin = tuple[Latitude, Longitude, Number]
 
 
 class _Part(RequestModel):
@@ -99,6 +102,12 @@ class ColmapModel(_Part):
 
     cameras: FailFastList[ColmapCamera] = Field(min_length=1, max_length=MAX_CAMERAS)
     photos: FailFastList[ColmapPhoto] = Field(min_length=3, max_length=MAX_PHOTOS)
+    origin: Origin | None = Field(
+        None,
+        description="latitude, longitude (degrees) and altitude (metres) of the model's zero, if "
+        "its axes are east, north and up in metres. Without it, the model is aligned to the "
+        "coordinates of its photos",
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:

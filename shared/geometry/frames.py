@@ -226,6 +226,21 @@ def align(
     return Alignment(origin, fitted[0], rms, distances, agrees, is_on_line)
 
 
+def align_at(
+    origin: EastNorthUp, centres: Floats, latitudes: Floats, longitudes: Floats
+) -> Alignment:
+    """Return the alignment of a component whose frame is the plane at the origin.
+
+    Coordinates of photos, (n,) degrees, NaN without, are only compared with it.
+    """
+    own = origin.from_geographic(latitudes, longitudes, np.full(len(centres), origin.altitude_m))
+    distances = np.linalg.norm((own - centres)[:, :2], axis=1)
+    agrees = distances <= INLIER_SIGMAS * GPS_SIGMA_M
+    rms = float(np.sqrt(np.mean(distances[agrees] ** 2))) if agrees.any() else 0.0
+    unmoved = Similarity(1.0, np.eye(3), np.zeros(3), np.zeros((7, 7)), centres.mean(axis=0))
+    return Alignment(origin, unmoved, rms, distances, agrees)
+
+
 def fit_similarity(
     points: Floats,
     targets: Floats,

@@ -163,7 +163,14 @@ def _estimate(
     component, numbers = components[pairs.component], pairs.point_numbers
     covariances = component.covariances[numbers].astype(float)
     points = component.points[numbers]
-    return estimate_absolute_pose(pairs.pixels, points, camera, focal_sigma, covariances)
+    return estimate_absolute_pose(
+        pairs.pixels,
+        points,
+        camera,
+        focal_sigma,
+        covariances,
+        is_lens_known=camera.rays is not None,
+    )
 
 
 def _doubt(

@@ -19,9 +19,9 @@ from shared.geometry.frames import (
 )
 from shared.geometry.localise import LocalPose
 
-CAMERA_MODEL_SIGMA = 0.0035
-"""radians by which rays are off together: of a focal length that is wrong by 1 %, or a principal
-point by 0.25 % of the longer side"""
+CAMERA_MODEL_SIGMA = 0.0025
+"""radians by which rays are off together, beyond what the covariance of a pose says: of a model
+whose focal length is wrong by 0.7 %, or its principal point by 0.2 % of the longer side"""
 NORMAL_68 = (1.0, 1.067)
 NORMAL_95 = (1.96, 1.731)
 """Quantiles of the length of a normal vector over its root mean square: in one dimension, and in

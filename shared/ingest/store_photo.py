@@ -26,6 +26,7 @@ from shared.catalog.maps import Map, get_map, increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole, find_same_photo
 from shared.errors import Conflict, TooManyRequests
 from shared.ids import new_id
+from shared.imaging.photo_header import PhotoHeader
 from shared.ingest.photo_metadata import PhotoFields
 from shared.ingest.validation import ValidatedPhoto
 from shared.jobs import Job, JobKind, JobState, Priority
@@ -117,11 +118,28 @@ def _photo_values(incoming: ValidatedPhoto) -> dict[str, Any]:
         "heading": fields.heading if fields.heading is not None else header.heading,
         "focal_length": header.focal_length,
         "captured_at": fields.captured_at or header.captured_at,
+        "capture": describe_capture(header, time_was_sent=fields.captured_at is not None),
         "place": fields.place,
         "tags": fields.tags or [],
         "attributes": fields.metadata or {},
         "role": fields.role or PhotoRole.DATABASE,
         "key_id": incoming.key_id,
+    }
+
+
+def describe_capture(header: PhotoHeader, time_was_sent: bool) -> dict[str, Any]:
+    """Return what locating a photo takes beside its time, as JSON.
+
+    Args:
+        time_was_sent: Whether its time is not that of the header: such a time is UTC.
+    """
+    offset = header.clock_offset
+    return {
+        "camera": header.camera,
+        "camera_is_unique": header.camera_is_unique,
+        "time_zone_is_known": time_was_sent or header.time_zone_is_known,
+        "clock_offset_seconds": None if offset is None or time_was_sent else offset.total_seconds(),
+        "gps_error": header.gps_error,
     }
 
 

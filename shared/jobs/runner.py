@@ -124,7 +124,7 @@ class JobRunner:
         """Repeat `work`, which returns whether there were jobs, until `stop` is set.
 
         Without jobs, `wait` waits for new ones, at most the given seconds: long in an embedded
-        server without any job, because nothing but a commit of this process can bring one.
+        server without any job, because nothing but a commit that it hears of can bring one.
         """
         while not stop.is_set():
             if self.run_once(work, stop) is False:

@@ -8,7 +8,7 @@ duplicate is harmless. Queries have a queue of their own, which workers look at 
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol, Self
@@ -101,15 +101,20 @@ class Wakeups(Protocol):
 
 
 class InProcessWakeups:
-    """Wakeups inside one process, for the embedded mode: at most one is outstanding."""
+    """Wakeups of an embedded server: at most one is outstanding.
+
+    Its extractor, in another process, is woken by `wake_extractor`.
+    """
 
     problem: str | None = None
 
-    def __init__(self) -> None:
+    def __init__(self, wake_extractor: Callable[[], object] = lambda: None) -> None:
         self._event = threading.Event()
+        self._wake_extractor = wake_extractor
 
     def send(self, *jobs: JobMessage) -> None:
         self._event.set()
+        self._wake_extractor()
 
     def resend(self, catalog: Catalog) -> int:
         with catalog.read() as session:

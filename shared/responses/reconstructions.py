@@ -9,6 +9,7 @@ from uuid import UUID
 from pydantic import AwareDatetime, Field
 
 from shared.responses import ResponseModel
+from shared.responses.similarity import PhotoResponse, SimilarPhotoResponse
 
 
 class ComponentResponse(ResponseModel):
@@ -98,12 +99,41 @@ class ProposalResponse(ResponseModel):
     """Where a photo was probably taken."""
 
     name: str
-    latitude: float | None = Field(description="null if nothing is known about its place")
-    longitude: float | None
+    latitude: float | None = Field(None, description="null if nothing is known about its place")
+    longitude: float | None = None
     radius_m: float
     probability: float = Field(description="that it was taken within `radius_m`")
-    radius_68_m: float | None
+    radius_68_m: float | None = None
     heading: float | None = Field(
         None, description="degrees clockwise from north; null unless the proposal rests on a pose"
     )
     reason: str
+
+
+class StoredProposalResponse(ProposalResponse):
+    """Where a photo of the map was probably taken that has no place."""
+
+    photo: PhotoResponse
+    place: str | None = Field(None, description="label, in a map of labels")
+    place_probability: float | None = None
+    looks_like: SimilarPhotoResponse | None = Field(
+        description="the most similar photo that has a place within `radius_m` of the proposal, "
+        "or its label"
+    )
+    error: str | None = Field(None, description="why the photo could not be searched with")
+
+
+class PlaceProposalsResponse(ResponseModel):
+    total: int = Field(description="number of photos without a place, not only of this page")
+    proposals: list[StoredProposalResponse] = Field(description="newest upload first")
+    next_cursor: str | None
+
+
+class GivenPlacesResponse(ResponseModel):
+    given: list[UUID]
+    skipped: dict[UUID, str] = Field(description="reasons by photo: it has a place meanwhile")
+
+
+class UndonePlacesResponse(ResponseModel):
+    restored: list[UUID] = Field(description="have the former values again")
+    changed_since: list[UUID] = Field(description="got another place since; left as they are")

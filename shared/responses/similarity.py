@@ -32,6 +32,16 @@ class SeenPoint(ResponseModel):
     """in the component's frame"""
 
 
+class GivenPlace(ResponseModel):
+    """What a place rests on that was given to a photo with `POST /places`."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    probability: float | None = Field(description="of the proposal; null if a person chose it")
+    reason: str
+    given_at: datetime
+
+
 class PhotoResponse(ResponseModel):
     """A stored photo."""
 
@@ -56,6 +66,9 @@ class PhotoResponse(ResponseModel):
     )
     captured_at: datetime | None
     place: str | None
+    given_place: GivenPlace | None = Field(
+        None, description="if the place was given here: what it rests on, until it is undone"
+    )
     role: Annotated[PhotoRole, OPEN]
     image_url: str
     thumbnail_url: str
@@ -164,10 +177,15 @@ class EstimateResponse(ResponseModel):
         "probability of 68 %; null without coordinates, or if it exceeds the largest level",
     )
     radius_95_m: float | None = Field(None, description="the same with 95 %")
+    new_to_map: bool = Field(
+        False,
+        description="whether the map's last searches are less similar to it than the photos that "
+        "its probabilities were measured on; `reason` says so",
+    )
     calibration_source: str | None = Field(
         None,
         description="what determines the probabilities most: `own_photos` or `labelled_queries` of "
-        "this map, or the `prior` of generated maps, near which a map of fewer than 200 evaluated "
+        "this map, or the `prior` of other maps, near which a map of fewer than 2,000 evaluated "
         "photos stays; null without levels",
     )
 

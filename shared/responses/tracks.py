@@ -24,7 +24,8 @@ class TrackStateResponse(ResponseModel):
     longitude: float | None
     place: str | None
     heading: float | None = Field(
-        description="of the nearest photo, degrees clockwise from north; null if the map has none"
+        description="degrees clockwise from north: of the frame's pose, or else of the nearest "
+        "photo; null if the map has none"
     )
     probability: float = Field(description="that the camera is at the finest level")
     levels: list[EstimateLevelResponse] = Field(

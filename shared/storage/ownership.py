@@ -21,9 +21,8 @@ from shared.storage.protocol import OwnedStore
 log = logging.getLogger(__name__)
 
 RECOVERY_ADVICE = (
-    "Restore the catalog (the file itself, or `placewise storage restore` into an empty one) or "
-    "correct DATABASE_URL; rebuild the catalog from the objects: placewise storage rebuild; or "
-    "make this catalog, which does not know those objects, the owner: placewise storage adopt."
+    "Restore the catalog (the file itself, or `placewise storage restore` into an empty one), "
+    "correct DATABASE_URL, or rebuild the catalog from the objects: placewise storage rebuild."
 )
 
 

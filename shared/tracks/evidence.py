@@ -60,6 +60,10 @@ class PositionFix(_Frozen):
     longitude: float = Field(ge=-180, le=180)
     accuracy_m: float = Field(gt=0, le=MAX_ACCURACY_M)
     """radius that contains the true position with a probability of 68 %"""
+    radius_95_m: float | None = Field(None, gt=0)
+    """of a pose; None of other positions"""
+    heading: float | None = Field(None, ge=0, le=360)
+    """of a pose: degrees clockwise from north"""
 
 
 class Odometry(_Frozen):

@@ -80,7 +80,7 @@ def test_many_photos_go_as_a_batch_with_counters_and_named_errors(
     page.get_by_text("Details for these photos").click()
     page.get_by_label("Tags").fill("north, wing")
     add(page, *[photo(number) for number in range(30)], NO_PHOTO)
-    expect(page.locator(".queue-row.failed .state")).to_have_text("30 added, 1 failed")
+    expect(page.locator(".queue-row.failed .state")).to_have_text("30 photos added, 1 failed")
     expect(page.locator(".errors li strong")).to_have_text("notes.jpg")
     assert searchable(page, city) == 30
     name = page.evaluate("localStorage.getItem('placewise-map')")
@@ -187,3 +187,14 @@ def test_a_lost_connection_is_shown_and_the_photo_sent_again(page: Page, city: C
     page.unroute("**/api/v1/upload?*")
     page.get_by_role("button", name="Try again").click()
     expect(page.locator(".queue-row.done .state")).to_have_text("Searchable")
+
+
+def test_photos_that_the_map_has_are_not_counted_as_added(page: Page, city: CityServer) -> None:
+    add(page, photo(1), photo(2))
+    expect(page.locator(".summary h2")).to_have_text("2 photos added")
+    page.get_by_role("button", name="Clear the list").click()
+    add(page, photo(2), photo(3))
+    expect(page.locator(".summary h2")).to_have_text("1 photo added, 1 already there")
+    page.get_by_role("button", name="Clear the list").click()
+    add(page, *[photo(number) for number in range(30)])
+    expect(page.locator(".queue-row.done .state")).to_have_text("27 photos added, 3 already there")

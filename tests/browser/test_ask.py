@@ -66,6 +66,7 @@ def test_each_level_and_each_match_has_its_probability(
         values = rows.locator("meter").evaluate_all("meters => meters.map(meter => meter.value)")
         assert values == shares
         assert sum(values) == 100
+        page.locator(".verdict summary").click()
         name = "Probability: Within 25 m"
         expect(page.get_by_role("meter", name=name)).to_be_visible()
     expect(page.locator(".match")).to_have_count(len(matches))
@@ -328,8 +329,8 @@ def test_the_page_shows_the_result_of_the_later_of_two_queries(
     page = visitor.visit("ask")
     held: list[Route] = []
     page.route("**/api/v1/similarity?*", lambda route: held.append(route), times=1)
-    page.locator("input[data-use=ask]").set_input_files(city.queries[0])
-    expect(page.get_by_role("heading", name="Looking for the place")).to_be_visible()
+    with page.expect_request("**/api/v1/similarity?*"):
+        page.locator("input[data-use=ask]").set_input_files(city.queries[0])
     page.locator("input[data-use=ask]").set_input_files(
         {"name": "later.jpg", "mimeType": "image/jpeg", "buffer": city.queries[1].read_bytes()}
     )
@@ -364,6 +365,8 @@ def test_a_match_is_shown_beside_the_photo_with_lines_between_their_points(
     expect(dialog.get_by_role("status")).to_have_text(caption)
     expect(dialog.get_by_role("img", name=caption)).to_be_visible()
     lines = dialog.locator(".lines line")
+    expect(lines).to_have_count(min(points, 30))
+    dialog.get_by_label("Lines").select_option("at most 150")
     expect(lines).to_have_count(min(points, 150))
     left, right = (dialog.locator(".frame img").nth(side).bounding_box() for side in (0, 1))
     assert left
@@ -379,11 +382,35 @@ def test_a_match_is_shown_beside_the_photo_with_lines_between_their_points(
         for (x, y), photo in zip(ends, (left, right), strict=True):
             assert photo["x"] - 1 <= x <= photo["x"] + photo["width"] + 1
             assert photo["y"] - 1 <= y <= photo["y"] + photo["height"] + 1
+    dialog.get_by_label("Lines").select_option("none")
+    expect(lines).to_have_count(0)
+    dialog.get_by_role("heading").focus()
     page.keyboard.press("ArrowRight")
     expect(dialog.get_by_role("heading")).to_have_text("Match 2 of 12")
     expect(dialog.get_by_role("status")).to_contain_text("points of both photos match")
     page.keyboard.press("Escape")
     expect(dialog).to_have_count(0)
+
+
+def test_no_lines_cover_the_photos_on_a_phone(visitor: Visitor, city: CityServer) -> None:
+    visitor.page.set_viewport_size({"width": 390, "height": 844})
+    page = ask(visitor, city.queries[0])
+    page.locator(".match").first.click()
+    dialog = page.get_by_role("dialog")
+    expect(dialog.get_by_label("Lines")).to_have_value("0")
+    expect(dialog.locator(".lines line")).to_have_count(0)
+
+
+def test_the_answer_names_the_folder_and_the_day_of_the_best_match(
+    visitor: Visitor, city: CityServer
+) -> None:
+    found = city.ask(city.queries[0])
+    found["estimate"] |= {"in_map": True}
+    best = max(found["similar_images"], key=lambda photo: photo["match_probability"] or 0)
+    best |= {"relative_path": "Sommer 2025/a.jpg", "captured_at": "2025-06-18T23:30:00Z"}
+    best["match_probability"] = 1.0
+    page = ask(visitor, city.queries[0], found)
+    expect(page.locator(".looks-like")).to_have_text("Looks like Sommer 2025, 18 June 2025")
 
 
 def test_a_photo_of_the_map_finds_its_neighbours_and_not_itself(
@@ -400,5 +427,6 @@ def test_an_empty_map_says_what_to_do_next(visitor: Visitor) -> None:
     page.goto(visitor.url)
     page.evaluate("localStorage.setItem('placewise-map', 'default')")
     visitor.visit("ask")
-    page.get_by_role("link", name="Add some first").click()
+    expect(page.get_by_text("by comparing it with photos whose place is known")).to_be_visible()
+    page.get_by_role("link", name="Add photos").click()
     expect(page.get_by_role("heading", name="Add photos")).to_be_visible()

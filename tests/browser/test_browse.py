@@ -55,6 +55,30 @@ def test_photos_are_filtered_by_name_tag_and_place(visitor: Visitor, city: CityS
     expect(page.get_by_role("heading", name="No photo matches the filter")).to_be_visible()
 
 
+def test_photos_are_sorted_by_when_they_were_taken_below_the_names_of_their_folders(
+    visitor: Visitor, city: CityServer
+) -> None:
+    ids = bring_in(city, "sorted-1.jpg", "sorted-2.jpg", "sorted-3.jpg")
+    for number, photo_id in enumerate(ids[:2]):
+        changed = {
+            "captured_at": f"2025-06-{18 - number}T12:00:00Z",
+            "relative_path": "Day 1/x.jpg",
+        }
+        city.server.client.patch(
+            f"/api/v1/uploads/{photo_id}", params={"map": MAP}, json=changed
+        ).raise_for_status()
+    page = visitor.visit("photos")
+    expect(page.get_by_role("heading", name="Day 1")).to_be_visible()
+    page.get_by_role("button", name="Only this folder").first.click()
+    expect(page.locator(".photo-card")).to_have_count(2)
+    page.get_by_label("Order").select_option("taken")
+    expect(page.locator(".photo-card").first).to_contain_text("18 June 2025")
+    expect(page.locator(".photo-card").last).to_contain_text("17 June 2025")
+    for photo_id in ids:
+        params = {"map": MAP, "permanently": "true"}
+        city.server.client.delete(f"/api/v1/uploads/{photo_id}", params=params)
+
+
 def test_the_map_shows_where_photos_are_and_takes_a_point(visitor: Visitor) -> None:
     page = visitor.visit("photos")
     # While the map is being loaded, the photos are requested again.
@@ -70,12 +94,12 @@ def test_the_map_shows_where_photos_are_and_takes_a_point(visitor: Visitor) -> N
     visitor.expect_no_error()
 
 
-def test_chosen_photos_are_tagged_and_deleted(visitor: Visitor, city: CityServer) -> None:
+def test_chosen_photos_are_tagged_removed_and_restored(visitor: Visitor, city: CityServer) -> None:
     ids = bring_in(city, "tagged-one.jpg", "tagged-two.jpg")
     page = visitor.visit("photos")
     page.get_by_label("Name").fill("tagged-")
     expect(page.locator(".photo-card")).to_have_count(2)
-    for box in page.get_by_role("checkbox").all():
+    for box in page.locator(".photo-card").get_by_role("checkbox").all():
         box.check()
     page.get_by_role("button", name="Tag…").click()
     page.get_by_label("Tags to add").fill("second, third")
@@ -83,14 +107,13 @@ def test_chosen_photos_are_tagged_and_deleted(visitor: Visitor, city: CityServer
     expect(page.locator(".photo-card .chips").first).to_contain_text("third")
     assert city.get(f"/uploads/{ids[0]}")["tags"] == ["first", "second", "third"]
 
-    page.get_by_role("checkbox").first.check()
-    page.get_by_role("button", name="Delete…").click()
-    page.get_by_role("button", name="Keep").click()
-    expect(page.locator(".photo-card")).to_have_count(2)
-    page.get_by_role("button", name="Delete…").click()
-    page.get_by_role("button", name="Delete", exact=True).click()
+    page.locator(".photo-card").get_by_role("checkbox").first.check()
+    page.get_by_role("button", name="Remove").click()
     expect(page.locator(".photo-card")).to_have_count(1)
     assert city.get("/search", filename="tagged-")["total_found"] == 1
+    page.locator(".note").get_by_role("button", name="Undo").click()
+    expect(page.locator(".photo-card")).to_have_count(2)
+    assert city.get("/search", filename="tagged-")["total_found"] == 2
 
 
 def test_a_photo_is_moved_and_named_and_shows_no_rounding_errors(
@@ -118,11 +141,28 @@ def test_a_photo_is_moved_and_named_and_shows_no_rounding_errors(
     expect(page.locator(".photo-name").first).to_have_text("Harbour <b>wall</b>")
 
 
-def test_a_photo_is_deleted_from_its_own_page(visitor: Visitor, city: CityServer) -> None:
+def test_a_removed_photo_is_restored_from_the_trash_or_deleted_for_good(
+    visitor: Visitor, city: CityServer
+) -> None:
     (photo_id,) = bring_in(city, "gone.jpg")
     page = visitor.visit(f"photo/{photo_id}")
-    page.get_by_role("button", name="Delete…").click()
-    page.get_by_role("button", name="Delete", exact=True).click()
+    page.get_by_role("button", name="Remove").click()
     expect(page.get_by_role("heading", name="Photos")).to_be_visible()
     gone = city.server.client.get(f"/api/v1/uploads/{photo_id}", params={"map": MAP})
     assert gone.status_code == 404
+
+    page.get_by_role("link", name="Trash").click()
+    card = page.locator(".photo-card", has_text="gone.jpg")
+    card.get_by_role("button", name="Restore").click()
+    expect(card).to_have_count(0)
+    assert city.get(f"/uploads/{photo_id}")["latitude"] == 44.0
+
+    city.server.client.delete(f"/api/v1/uploads/{photo_id}", params={"map": MAP})
+    visitor.visit("trash")
+    card.get_by_role("button", name="Delete for good…").click()
+    page.get_by_role("button", name="Keep").click()
+    expect(card).to_have_count(1)
+    card.get_by_role("button", name="Delete for good…").click()
+    page.get_by_role("button", name="Delete for good", exact=True).click()
+    expect(card).to_have_count(0)
+    assert city.get("/search", removed=True, filename="gone")["total_found"] == 0

@@ -11,7 +11,7 @@ from playwright.sync_api import Page, expect
 from tests.browser.conftest import CityServer, Visitor
 
 VIEWS = ["ask", "answer", "compare", "photos", "photo", "tracks", "track"]
-VIEWS += ["add", "locate", "model", "status"]
+VIEWS += ["add", "locate", "places", "trash", "model", "status"]
 SERIOUS = {"serious", "critical"}
 
 

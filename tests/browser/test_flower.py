@@ -18,10 +18,10 @@ from PIL import Image
 from playwright.sync_api import Browser, expect
 from sqlalchemy import select
 
-from lab.benchmarks.fleet import Fleet, open_fleet
-from lab.benchmarks.invariants import count_unfinished_jobs
 from shared.catalog.jobs import Job
 from shared.jobs.wakeups import WakeupQueue
+from tests.support.fleet import Fleet, open_fleet
+from tests.support.invariants import count_unfinished_jobs
 from tests.support.photos import photo_bytes
 from tests.support.server import SERVICES_KEY
 from tests.support.servers.daemon import free_ports

@@ -70,8 +70,7 @@ def test_a_read_only_key_gets_a_message_that_names_the_missing_scope(
     page.get_by_role("link", name="Photos").click()
     page.locator(".photo-card input").check()
     for _ in range(2):
-        page.get_by_role("button", name="Delete…").click()
-        page.get_by_role("button", name="Delete", exact=True).click()
+        page.get_by_role("button", name="Remove").click()
         expect(page.locator(".note")).to_have_count(1)
         expect(page.locator(".note")).to_contain_text("requires the scope “write”")
         page.locator(".photo-card input").check()

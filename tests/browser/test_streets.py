@@ -77,6 +77,29 @@ def test_the_graticule_stays_where_no_streets_can_be_loaded(
     expect(page.get_by_role("button", name="Streets")).to_have_attribute("aria-pressed", "false")
 
 
+@pytest.mark.parametrize("tiles", ["chosen", "off"])
+def test_streets_of_a_chosen_server_are_shown_at_once_and_a_map_without_says_so(
+    visiting: Visitor, city: CityServer, tiles: str
+) -> None:
+    settings = city.server.client.get("/console/settings.json").json()
+    settings |= {"map_tiles_are_chosen": True} if tiles == "chosen" else {"map_tiles": None}
+    visiting.page.route("**/console/settings.json", lambda route: route.fulfill(json=settings))
+    page = open_map(visiting, city)
+    if tiles == "off":
+        expect(page.locator(".map-note")).to_contain_text("No streets")
+        expect(page.get_by_role("button", name="Streets")).to_have_count(0)
+        return
+    expect(page.locator(".leaflet-tile-loaded").first).to_be_visible()
+    page.get_by_role("button", name="Streets").click()
+    expect(page.locator(".graticule-label").first).to_be_visible()
+    page = open_map(visiting, city)  # hidden until the visitor wants them
+    expect(page.locator(".graticule-label").first).to_be_visible()
+    expect(page.locator(".leaflet-tile")).to_have_count(0)
+    page.get_by_role("button", name="Streets").click()
+    expect(page.locator(".leaflet-tile-loaded").first).to_be_visible()
+    assert visiting.faults == []
+
+
 def test_the_policy_lets_images_of_the_tile_server_through_and_nothing_else(
     visiting: Visitor, city: CityServer
 ) -> None:

@@ -15,7 +15,7 @@ from sqlalchemy import text, update
 
 from services.http_server import SHUTDOWN_GRACE_SECONDS
 from shared.catalog.database.session import Catalog
-from shared.catalog.jobs import EXTRACTOR_JOBS, STEWARD_JOBS, WaitingFor
+from shared.catalog.jobs import EXTRACTOR_JOBS, JobKind, WaitingFor
 from shared.config.settings import SECRET_SETTINGS, Settings
 from shared.jobs import Job, JobState
 from tests.deploy.composition import ROOT, SERVICES, services
@@ -469,7 +469,7 @@ def test_extractors_are_scaled_by_the_jobs_that_wait_for_them_or_are_under_way(
     assert counted() == 0
     with on_postgres.write() as session:
         map_id = add_map(session, "default", "test-tiny-avg").id
-        for kind in (*EXTRACTOR_JOBS, *STEWARD_JOBS):
+        for kind in JobKind:
             for state in JobState:
                 session.add(Job(map_id=map_id, kind=kind, state=state, priority=1))
             waits = {"state": JobState.QUEUED, "waiting_for": WaitingFor.VOCABULARY}

@@ -17,6 +17,7 @@ from tests.e2e.hostile_files import (
 from tests.support.hostile_headers import MANY_PARTS, heic_of_endless_extents
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess
+from tests.support.waiting import wait_until
 
 SETTINGS = {
     "max_file_size": MAX_BYTES,
@@ -115,10 +116,9 @@ def test_headers_of_too_many_parts_hold_up_no_call_no_batch_and_no_end(
             "/api/v1/upload/batch", files=[("file", member) for member in members.items()]
         )
         job_url = f"/api/v1/jobs/{answer.json()['job_id']}"
-        deadline = time.monotonic() + SECONDS
-        while server.client.get(job_url).json()["progress"]["failed"] < len(files):
-            assert time.monotonic() < deadline, server.log()
-            time.sleep(0.1)
+        wait_until(
+            lambda: server.client.get(job_url).json()["progress"]["failed"] == len(files), SECONDS
+        )
         assert server.client.post(f"{job_url}/cancel").json()["state"] == "cancelled"
     assert server.stop() == 0
     server.start()

@@ -11,7 +11,6 @@ from typing import Any
 from uuid import uuid4
 
 import httpx2
-import pytest
 
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
@@ -117,21 +116,6 @@ def test_jobs_are_listed_newest_first_by_state_and_kind_page_by_page(
         read += [job["job_id"] for job in page["jobs"]]
         cursor = {"cursor": page["next_cursor"]}
     assert (read, page["next_cursor"]) == (whole, None)
-
-
-@pytest.mark.parametrize(
-    ("params", "named"),
-    [
-        ({"state": "asleep"}, "state.0"),
-        ({"kind": "coffee"}, "kind.0"),
-        ({"limit": "1001"}, "limit"),
-        ({"cursor": "page two"}, "cursor"),
-    ],
-)
-def test_a_bad_filter_is_refused_by_name(
-    server: ServerProcess, params: dict[str, str], named: str
-) -> None:
-    field_refused(server.client.get(JOBS, params=params), named)
 
 
 def test_unknown_jobs_are_not_found(server: ServerProcess) -> None:

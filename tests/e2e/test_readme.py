@@ -9,17 +9,16 @@ import re
 import signal
 import socket
 import subprocess
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import httpx2
-import psutil
 import pytest
 
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.processes import forked_program
+from tests.support.waiting import wait_until
 
 REPOSITORY = Path(__file__).parents[2]
 README = REPOSITORY / "README.md"
@@ -66,49 +65,34 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@dataclass(frozen=True, slots=True)
-class RunningShell:
-    process: subprocess.Popen[bytes]
-    port: int
-
-
 @pytest.fixture(scope="module")
-def shell(place: Path) -> Iterator[RunningShell]:
-    """A shell with `make run`, from the repository, on a free port.
-
-    It ignores neither SIGINT nor SIGHUP, as it would inherit it from tests that a script runs in
-    the background or under `nohup`: there, a server outlives its shell.
-    """
+def port(place: Path) -> Iterator[int]:
+    """The free port of a server that `make run` has started from the repository."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         free: int = probe.getsockname()[1]
-    environment = _environment(place)
     with (place / "run.log").open("wb") as log:
         process = subprocess.Popen(
-            ["bash", "-c", f"make run PORT={free}; exit"],
+            ["make", "run", f"PORT={free}"],
             cwd=REPOSITORY,
-            env=environment,
+            env=_environment(place),
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
             start_new_session=True,
-            preexec_fn=_heed_signals,
         )
+
+    def shows_its_address() -> bool:
+        shown = (place / "run.log").read_text()
+        assert process.poll() is None, shown
+        return bool(re.search(r"^  open: .+\n", shown, re.MULTILINE))
+
     try:
-        deadline = time.monotonic() + 120
-        while not re.search(r"^  open: .+\n", (place / "run.log").read_text(), re.MULTILINE):
-            assert process.poll() is None, (place / "run.log").read_text()
-            assert time.monotonic() < deadline, (place / "run.log").read_text()
-            time.sleep(0.1)
-        yield RunningShell(process, free)
+        wait_until(shows_its_address)
+        yield free
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGTERM)
         process.wait(timeout=60)
-
-
-@pytest.fixture
-def port(shell: RunningShell) -> int:
-    return shell.port
 
 
 def _run(text: str, place: Path) -> subprocess.CompletedProcess[str]:
@@ -156,25 +140,10 @@ def test_the_readmes_python_prints_an_estimate(place: Path, port: int) -> None:
     assert "latitude=" in done.stdout
 
 
-def test_make_run_shows_the_address_last_and_ends_its_server_with_its_shell(
-    place: Path, shell: RunningShell
-) -> None:
-    """The last test with this server, which it ends."""
-    [shown] = re.findall(
-        r"^Placewise serves .+\n(?:  .+\n)+", (place / "run.log").read_text(), re.M
-    )
-    assert shown.endswith(f" http://127.0.0.1:{shell.port}\n")
-    started = psutil.Process(shell.process.pid).children(recursive=True)
-    assert any("serve" in process.cmdline() for process in started)
-    shell.process.kill()
-    shell.process.wait(timeout=60)
-    _, running = psutil.wait_procs(started, timeout=120)
-    assert not running, (place / "run.log").read_text()
-
-
-def _heed_signals() -> None:
-    for number in (signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, signal.SIG_DFL)
+def test_make_run_shows_the_address_last(place: Path, port: int) -> None:
+    shown = (place / "run.log").read_text()
+    [block] = re.findall(r"^Placewise serves .+\n(?:  .+\n)+", shown, re.M)
+    assert block.endswith(f" http://127.0.0.1:{port}\n")
 
 
 def test_make_alone_lists_its_targets_and_knows_each() -> None:

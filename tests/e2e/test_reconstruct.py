@@ -113,12 +113,19 @@ def test_exported_model_is_one_that_can_be_imported(walk: ServerProcess) -> None
     assert made["imported"]
     assert (made["result"]["photos"], made["result"]["unmatched"]) == (SCENE.photos, 0)
     assert made["components"][0]["photos"] == SCENE.photos
+    refused = run(walk, "reconstruct", "--import", out / "0", "--origin", "45,7", fails=True)
+    assert "bad_origin" in refused
+    placed = result(walk, "reconstruct", "--import", out / "0", "--origin=-33.9,18.4,25")
+    (component,) = placed["components"]
+    assert (component["latitude"], component["longitude"]) == (-33.9, 18.4)
+    assert component["metres_per_unit"] == 1
 
 
 @pytest.mark.parametrize(
     "options",
     [
         ("--images", "photos"),
+        ("--origin", "45,7,240"),
         ("--from-scratch", "--import", "photos"),
         ("--proposals", "list", "--from-scratch"),
     ],

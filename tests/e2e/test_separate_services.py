@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 import signal
-import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import httpx2
+import psutil
 import pytest
 
 from tests.support.photos import photo_bytes
 from tests.support.processes import PLACEWISE, Process, start
 from tests.support.server import SERVICES_KEY, environment, run_command
 from tests.support.servers import PostgresServer, RedisServer, start_redis
+from tests.support.waiting import wait_until
 
 SECONDS = 90.0
 CRASHING = Path(__file__).with_name("crashing_placewise.py")
@@ -64,14 +65,14 @@ class Deployment:
     def announced(self, service: str, number: int, pattern: str) -> str:
         """The group of `pattern` in what that process says once it is ready."""
         log = self.root / f"{service}-{number}.log"
-        deadline = time.monotonic() + SECONDS
-        while time.monotonic() < deadline:
+
+        def find() -> re.Match[str] | None:
+            ended = self._processes[number].poll() is not None
             found = re.search(pattern, log.read_text())
-            if found:
-                return found[1]
-            assert self._processes[number].poll() is None, log.read_text()
-            time.sleep(0.05)
-        raise AssertionError(log.read_text())
+            assert found or not ended, log.read_text()
+            return found
+
+        return wait_until(find, SECONDS)[1]  # type: ignore[index]  # it is a match by now
 
     def logs(self) -> str:
         return "\n".join(
@@ -96,17 +97,6 @@ def deployment(tmp_path: Path, postgres: PostgresServer) -> Iterator[Deployment]
             made.close()
 
 
-def until(what: Any) -> Any:
-    deadline = time.monotonic() + SECONDS
-    while True:
-        with contextlib.suppress(httpx2.TransportError):
-            found = what()
-            if found:
-                return found
-        assert time.monotonic() < deadline, "it did not come to that"
-        time.sleep(0.1)
-
-
 def test_services_in_processes_of_their_own_do_what_the_embedded_one_does(
     deployment: Deployment,
 ) -> None:
@@ -118,7 +108,7 @@ def test_services_in_processes_of_their_own_do_what_the_embedded_one_does(
     extractors = [deployment.start("extractor") for _ in range(2)]
     stewards = [deployment.start("steward") for _ in range(2)]
     with deployment.client(2) as client:
-        until(lambda: client.get("/readyz").is_success)
+        wait_until(lambda: client.get("/readyz").is_success, SECONDS)
 
         def put(number: int) -> dict[str, Any]:
             answer = client.post(
@@ -148,7 +138,7 @@ def test_services_in_processes_of_their_own_do_what_the_embedded_one_does(
             return body["similar_images"][0]["original_filename"]
 
         for upload in [put(number) for number in range(24)]:
-            until(lambda upload=upload: ended(upload["job_id"]))
+            wait_until(partial(ended, upload["job_id"]), SECONDS)
         assert first_match(photo_bytes(5)) == "5.jpg"
 
         # One extractor and one steward die in the middle of work; the others go on.
@@ -156,13 +146,13 @@ def test_services_in_processes_of_their_own_do_what_the_embedded_one_does(
         extractors[0].send_signal(signal.SIGKILL)
         stewards[0].send_signal(signal.SIGKILL)
         for upload in uploads:
-            until(lambda upload=upload: ended(upload["job_id"]))
+            wait_until(partial(ended, upload["job_id"]), SECONDS)
         assert first_match(photo_bytes(60)) == "60.jpg"
         stats = client.get("/api/v1/database/stats").json()
         assert (stats["total_images"], stats["searchable_images"]) == (64, 64)
 
         evaluation = client.post("/api/v1/evaluations", json={"sample": 30}).json()
-        until(lambda: ended(evaluation["job_id"]))
+        wait_until(partial(ended, evaluation["job_id"]), SECONDS)
         assert client.get("/api/v1/evaluations").json()["evaluations"]
 
         for process in (extractors[1], stewards[1]):
@@ -181,7 +171,7 @@ def test_services_in_processes_of_their_own_do_what_the_embedded_one_does(
             "steward",
             ["wakeups", "steward", "collect_orphans", "evaluator", "batches", "webhooks"],
         ),
-        ("serve", ["search", "extractor", "steward", "collect_orphans"]),
+        ("serve", ["search", "extractor", "extractor process", "steward", "collect_orphans"]),
     ],
 )
 def test_a_thread_that_crashes_ends_its_process(
@@ -197,6 +187,9 @@ def test_a_thread_that_crashes_ends_its_process(
     for number, process in enumerate(processes):
         deployment.announced(service, number, r"Placewise (.*(serves|listens|is running))")
         process.send_signal(signal.SIGRTMIN)
+        if threads[number] == "extractor" and service == "serve":
+            (extractor,) = psutil.Process(process.pid).children()
+            extractor.send_signal(signal.SIGRTMIN)
     for number, (name, process) in enumerate(zip(threads, processes, strict=True)):
         log = deployment.root / f"{service}-{number}.log"
         assert process.wait(timeout=SECONDS) == 1, f"{name}: {log.read_text()[-3000:]}"

@@ -7,7 +7,6 @@ import http.client
 import json
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime, timedelta
@@ -22,6 +21,7 @@ from PIL.ExifTags import GPS, IFD
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 from tests.support.server import ServerProcess
+from tests.support.waiting import wait_until
 
 MAX_FILE_SIZE = 100_000
 UPLOAD = "/api/v1/upload"
@@ -36,10 +36,8 @@ def stored(server: ServerProcess) -> set[Path]:
 def check_nothing_is_left(server: ServerProcess, before: set[Path]) -> None:
     """The store is as it was, and what was half written is gone."""
     assert stored(server) == before
-    deadline = time.monotonic() + 10
-    while half_written := list((server.home / "objects" / ".partial").iterdir()):
-        assert time.monotonic() < deadline, half_written  # others write there, but not for long
-        time.sleep(0.01)
+    # Others write there, but not for long.
+    wait_until(lambda: not list((server.home / "objects" / ".partial").iterdir()), 10)
 
 
 def photo(server: ServerProcess, file_id: str) -> dict[str, Any]:

@@ -35,6 +35,7 @@ from shared.search_api.protocol import SearchRequest
 from shared.storage import FolderStore
 from tests.support.photos import photo_bytes
 from tests.support.servers import PostgresServer, start_postgres
+from tests.support.waiting import wait_until
 
 API = "/api/v1"
 STATEMENT_SECONDS = 2.0
@@ -119,9 +120,7 @@ class Deployment:
             return session.scalar(select(func.count()).select_from(Descriptor)) or 0
 
     def wait_for(self, searchable: int) -> None:
-        deadline = time.monotonic() + RECOVERY_SECONDS
-        while self.searchable() < searchable and time.monotonic() < deadline:
-            time.sleep(0.1)
+        wait_until(lambda: self.searchable() >= searchable, RECOVERY_SECONDS)
         assert self.searchable() == searchable
 
     def request(self, photo_id: str) -> SearchRequest:
@@ -201,10 +200,7 @@ def test_catalog_killed_under_uploads_loses_nothing_that_was_acknowledged(
         parts = deployment.call("GET", f"{API}/health")
         assert (parts.status_code, parts.json()["parts"]["catalog"]["status"]) == (503, "unhealthy")
         assert deployment.search.search(request).hits, "search answers from memory"
-        deadline = time.monotonic() + ANSWER_SECONDS
-        while not all(waits(part) for part in WAITING_PARTS):
-            assert time.monotonic() < deadline, "a part has not met the outage"
-            time.sleep(0.1)
+        wait_until(lambda: all(waits(part) for part in WAITING_PARTS), ANSWER_SECONDS)
         time.sleep(3.0)  # every loop meets it several times
     finally:
         breakable.process.start()
@@ -217,7 +213,8 @@ def test_catalog_killed_under_uploads_loses_nothing_that_was_acknowledged(
     assert deployment.call("GET", "/readyz").status_code == 200
     assert deployment.is_complete(), "a part ended"
     for part in WAITING_PARTS:
-        assert len(waits(part)) == 1, f"once per outage: {waits(part)}"
+        # Once per outage, and again where what had begun before it succeeded in it.
+        assert 1 <= len(waits(part)) <= 2, waits(part)
 
 
 def test_silent_catalog_is_given_up_within_seconds(
@@ -232,8 +229,6 @@ def test_silent_catalog_is_given_up_within_seconds(
         assert deployment.call("GET", "/livez").status_code == 200
     finally:
         breakable.process.resume()
-    deadline = time.monotonic() + RECOVERY_SECONDS
-    while deployment.call("GET", "/readyz").status_code != 200 and time.monotonic() < deadline:
-        time.sleep(0.1)
+    wait_until(lambda: deployment.call("GET", "/readyz").is_success, RECOVERY_SECONDS)
     assert deployment.call("GET", f"{API}/search").status_code == 200
     assert deployment.is_complete()

@@ -12,12 +12,13 @@ from uuid import UUID
 import httpx2
 import psutil
 
-from lab.benchmarks.invariants import check_invariants, count_unfinished_jobs
 from shared.catalog.database.session import Catalog
 from shared.storage import FolderStore
+from tests.support.invariants import count_unfinished_jobs, find_violations
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess
 from tests.support.servers.daemon import has_ended
+from tests.support.waiting import wait_until
 
 PHOTOS = 75
 KILLS = 5
@@ -81,13 +82,12 @@ def test_after_five_kills_every_acknowledged_photo_is_searchable_exactly_once(
         assert len(uploader.acknowledged) == PHOTOS
 
         catalog = Catalog(f"sqlite:///{server.home / 'catalog.sqlite'}")
-        wait_until_nothing_is_left_to_do(catalog)
+        wait_until(lambda: not count_unfinished_jobs(catalog), 60)
         expected = {
             hashlib.sha256(photo_bytes(number)).hexdigest(): UUID(file_id)
             for number, file_id in uploader.acknowledged.items()
         }
-        counts = check_invariants(catalog, FolderStore(server.home / "objects"), expected)
-        assert counts.none_found, counts
+        assert not find_violations(catalog, FolderStore(server.home / "objects"), expected)
         catalog.close()
         assert_each_finds_itself(server, uploader.acknowledged)
 
@@ -98,17 +98,21 @@ def test_decoding_children_end_with_a_killed_server(tmp_path: Path) -> None:
         children = psutil.Process(server.process.pid).children(recursive=True)
         assert children
         server.kill()
-        deadline = time.monotonic() + 20
-        while not all(has_ended(child) for child in children):
-            assert time.monotonic() < deadline, children
-            time.sleep(0.05)
+        wait_until(lambda: all(has_ended(child) for child in children), 20)
 
 
-def wait_until_nothing_is_left_to_do(catalog: Catalog) -> None:
-    deadline = time.monotonic() + 60
-    while left := count_unfinished_jobs(catalog):
-        assert time.monotonic() < deadline, f"{left} jobs are stuck"
-        time.sleep(0.1)
+def test_a_server_whose_extractor_is_killed_ends_and_describes_the_photo_when_started_again(
+    tmp_path: Path,
+) -> None:
+    with ServerProcess(tmp_path / "home") as server:
+        server.indexed(photo_bytes(1))
+        (extractor,) = psutil.Process(server.process.pid).children()
+        uploaded = server.upload(photo_bytes(2)).json()
+        extractor.kill()
+        assert server.process.wait(60) == 1
+        assert "extractor_ended: The extractor's process ended with code -9" in server.log()
+        server.start()
+        assert server.finished(uploaded["job_id"])["state"] == "succeeded"
 
 
 def assert_each_finds_itself(server: ServerProcess, acknowledged: dict[int, str]) -> None:

@@ -1,4 +1,4 @@
-"""The catalog removed, another one, or an older one: no original of the store is deleted.
+"""The catalog removed, another one, an older one: no start; many orphans: none is collected.
 
 Orphans of any age may be collected here (ORPHAN_AGE_SECONDS=0), and each start of a server collects
 at once.
@@ -18,7 +18,7 @@ import pytest
 
 from shared.config.settings import Settings
 from shared.storage import OwnedStore
-from shared.storage.keys import JOURNAL, ORIGINALS, TRASH, key_before_trash
+from shared.storage.keys import JOURNAL, ORIGINALS, TRASH, key_before_trash, new_original_key
 from shared.storage.open_store import open_store
 from tests.support.metrics import read
 from tests.support.photos import photo_bytes
@@ -26,6 +26,7 @@ from tests.support.server import ServerProcess, environment, run_command
 from tests.support.servers import S3Server
 from tests.support.waiting import wait_until
 
+ORPHANS = 101  # more than are collected without asking
 EARLY, LATE = 2, 3  # photos before and after the catalog was copied
 SETTINGS = {"orphan_age_seconds": 0, "auto_evaluate_photos": 0}
 
@@ -71,7 +72,6 @@ class Filled:
         assert done.returncode == 1, done.stderr
         assert "folder_taken" in done.stderr or "bucket_taken" in done.stderr
         assert "placewise storage rebuild" in done.stderr
-        assert "placewise storage adopt" in done.stderr
 
 
 @pytest.fixture(scope="module", params=["folder", "bucket"])
@@ -149,44 +149,36 @@ def test_older_catalog_stops_every_start_and_no_object_is_touched(filled: Filled
     assert {info.key for info in filled.store.list("")} == before
 
 
-def test_a_removed_catalog_stops_every_start_until_the_store_is_adopted_which_deletes_nothing(
-    filled: Filled,
-) -> None:
-    originals, before = filled.originals(), filled.stored_photos()
-    objects = {info.key for info in filled.store.list("")}
-    owner = filled.store.read_note(".placewise")
-    assert owner is not None
+def test_a_removed_catalog_stops_every_start_and_no_object_is_touched(filled: Filled) -> None:
+    before = {info.key for info in filled.store.list("")}
     filled.remove_catalog()
     filled.check_refused("serve")
     assert not (filled.home / "catalog.sqlite").exists(), "a restored file would meet it"
-    assert {info.key for info in filled.store.list("")} == objects
-    shown = filled.command("storage", "adopt", "--json")
-    assert shown.returncode == 0, shown.stderr
-    body = json.loads(shown.stdout)
-    assert body["adopted"] is False
-    assert body["unknown"]["originals/"]["objects"] == len(originals)
-    filled.check_refused("serve")
+    assert {info.key for info in filled.store.list("")} == before
 
-    assert filled.command("storage", "adopt", "--confirm").returncode == 0
+
+def test_many_orphans_are_held_until_their_collection_is_confirmed(filled: Filled) -> None:
+    def run(*arguments: str) -> Any:
+        return json.loads(filled.command(*arguments, "--json").stdout)
+
+    originals, orphans = filled.originals(), {new_original_key() for _ in range(ORPHANS)}
+    for key in orphans:
+        filled.store.put(key, b"orphan")
     with filled.server(**SETTINGS) as running:
         _wait_for_collection(running)
         assert _figures(running)["placewise_steward_collection_held"] == {(): 1}
-        assert filled.originals() == originals
-        findings = json.loads(filled.command("doctor", "--json").stdout)
-        (found,) = [one for one in findings if one["part"] == "server object store"]
+        (found,) = [one for one in run("doctor") if one["part"] == "server object store"]
         assert not found["ok"]
         assert "storage collect" in found["detail"]
-        listed = json.loads(filled.command("storage", "collect", "--json").stdout)
-        assert (listed["moved"], listed["held"]) == (0, "adopted")
-        confirmed = json.loads(filled.command("storage", "collect", "--confirm", "--json").stdout)
-        assert confirmed["moved"] >= len(originals)
-        assert filled.originals() == set()
-        assert filled.stored_photos() >= originals
-        verified = json.loads(filled.command("storage", "verify", "--json").stdout)
-        assert verified["trash_objects"] == confirmed["moved"]
-        assert verified["trash_bytes"] > 0
-        back = json.loads(filled.command("storage", "restore-trash", "--json").stdout)
-        assert back == {"restored": confirmed["moved"], "kept_in_trash": 0}
-    assert filled.originals() == originals
-    filled.store.write_note(".placewise", owner)  # of the bucket, for the other tests
-    assert filled.stored_photos() >= before
+        listed = run("storage", "collect")
+        assert (listed["moved"], listed["held"]) == (0, True)
+        assert listed["unknown"]["originals/"]["objects"] == ORPHANS
+        assert filled.originals() == originals | orphans
+        assert run("storage", "collect", "--confirm")["moved"] == ORPHANS
+        assert filled.originals() == originals
+        assert run("storage", "verify")["trash_objects"] == ORPHANS
+        back = run("storage", "restore-trash")
+        assert back == {"restored": ORPHANS, "kept_in_trash": 0}
+    assert filled.originals() == originals | orphans
+    for key in orphans:
+        filled.store.delete(key)

@@ -14,16 +14,16 @@ import httpx2
 import pytest
 from sqlalchemy import select
 
-from lab.benchmarks.fleet import open_fleet
-from lab.benchmarks.load_generator import wait_for_jobs
 from shared.catalog.chunks import Descriptor
+from tests.support.fleet import open_fleet
+from tests.support.invariants import count_unfinished_jobs
 from tests.support.photos import photo_bytes
 from tests.support.server import SERVICES_KEY
+from tests.support.waiting import wait_until
 
 ONE_OF_EACH = ("gateway-0", "extractor-0", "search-0", "steward-0")
 FIRST_PHOTOS = 12
 PAUSE_SECONDS = 0.1  # between a client's requests, so that the CPU is not saturated
-SECONDS = 120.0
 
 
 class Clients:
@@ -148,7 +148,7 @@ def test_restarting_one_of_each_service_fails_no_request_and_loses_no_job() -> N
         assert not fleet.crashed
         assert min(clients.answered.values()) >= len(ONE_OF_EACH), clients.answered
         assert len(clients.answered) == 4, clients.answered
-        wait_for_jobs(fleet.catalog, SECONDS)
+        wait_until(lambda: not count_unfinished_jobs(fleet.catalog))
         with fleet.catalog.read() as session:
             described = set(session.scalars(select(Descriptor.photo_id)))
         assert {UUID(photo) for photo in clients.uploaded} <= described

@@ -40,6 +40,7 @@ PRIORITIES = {
     JobKind.REINDEX: Priority.REINDEX,
     JobKind.DESCRIBE: Priority.QUERY,
     JobKind.EVALUATE: Priority.EVALUATION,
+    JobKind.SYNC_LIBRARY: Priority.BATCH,
     **dict.fromkeys(
         (*MODEL_CHANGE_JOBS, JobKind.ADD_MODEL, JobKind.RECONSTRUCT), Priority.MODEL_CHANGE
     ),

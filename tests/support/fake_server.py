@@ -52,11 +52,17 @@ class Handler(BaseHTTPRequestHandler):
 
 @contextlib.contextmanager
 def running_server() -> Iterator[FakeServer]:
-    with FakeServer() as made:
-        thread = threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        try:
-            yield made
-        finally:
-            made.shutdown()
-            thread.join()
+    with FakeServer() as made, serving(made):
+        yield made
+
+
+@contextlib.contextmanager
+def serving(made: HTTPServer) -> Iterator[None]:
+    """Answer in a thread while the block runs."""
+    thread = threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    try:
+        yield
+    finally:
+        made.shutdown()
+        thread.join()

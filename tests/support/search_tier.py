@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import threading
-import time
 from types import TracebackType
 from typing import Self
 
@@ -18,6 +17,7 @@ from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.search_api.client import SEARCH_TIMEOUT_SECONDS, HttpSearchClient
 from shared.storage import ObjectStore
+from tests.support.waiting import wait_until
 
 START_SECONDS = 20.0
 
@@ -57,10 +57,8 @@ class SearchServer:
 
     def wait_until_started(self) -> None:
         assert self._running is not None
-        deadline = time.monotonic() + START_SECONDS
-        while not self._running[0].started:
-            assert time.monotonic() < deadline, "a search server did not start"
-            time.sleep(0.005)
+        server = self._running[0]
+        wait_until(lambda: server.started, START_SECONDS)
 
     def ask_to_stop(self) -> None:
         if self._running is not None:

@@ -201,7 +201,8 @@ class ServerProcess:
     @contextlib.contextmanager
     def no_decoding(self) -> Iterator[None]:
         """While the block runs no photo is decoded, so that what needs one stays under way."""
-        decoders = psutil.Process(self.process.pid).children()
+        (extractor,) = psutil.Process(self.process.pid).children()
+        decoders = extractor.children()
         assert decoders, "they start with the first photo: index one before"
         for decoder in decoders:
             decoder.suspend()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import pickle
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
-from shared.telemetry.logs import LOG_FILE_BYTES, configure_logging
+from shared.telemetry.logs import LOG_FILE_BYTES, configure_logging, forward_logs
 from shared.telemetry.tracing import request_id_context, request_id_or_new
 
 Set = Callable[..., None]
@@ -164,3 +165,23 @@ def test_commands_beside_a_server_leave_its_log_file_alone(set_up: Set, tmp_path
     configure_logging(Settings(), "keys", to_file=False)
     logging.getLogger("services").info("a key")
     assert (tmp_path / "server.log").read_text() == ""
+
+
+@pytest.mark.parametrize("log_format", ["json", "text"])
+def test_records_of_the_extractors_process_are_logged_by_the_server_with_their_traceback(
+    set_up: Set, capsys: pytest.CaptureFixture[str], log_format: str
+) -> None:
+    sent: list[bytes] = []
+    forward_logs(Settings(), lambda record: sent.append(pickle.dumps(record)))
+    with request_id_context("r-1"):
+        try:
+            raise ValueError("why")
+        except ValueError:
+            logging.getLogger("services").exception("photo %d failed", 7, extra={"jobs": [1]})
+    assert capsys.readouterr().err == ""
+    set_up(LOG_FORMAT=log_format)
+    record: logging.LogRecord = pickle.loads(sent.pop())
+    logging.getLogger(record.name).handle(record)
+    text = capsys.readouterr().err
+    for expected in ("photo 7 failed", "r-1", "jobs", "ValueError: why"):
+        assert expected in text

@@ -13,21 +13,7 @@ import typer
 from services.cli.environment import read_settings, require_packages
 from services.cli.output import JsonOption, print_result, progress_bar
 from shared.errors import InvalidRequest
-from shared.extractor_config.configs import (
-    EXTRACTOR_AGGREGATORS,
-    EXTRACTOR_CONFIGS,
-    FACETS,
-    PREPROCESSING_NAMES,
-    add_extractor_options,
-    get_extractor_config,
-)
-
-# Keyed by the publisher's names, such as `dinov2_vits14`.
-BACKBONES = {
-    config.backbone.replace("dinov2-", "dinov2_"): name
-    for name, config in EXTRACTOR_CONFIGS.items()
-    if not config.for_tests
-}
+from shared.extractor_config.configs import get_extractor_config
 
 
 def describe(
@@ -48,9 +34,6 @@ def describe(
             help="Extractor name, with options as in EXTRACTOR. Default: the setting EXTRACTOR.",
         ),
     ] = None,
-    backbone: Annotated[
-        str | None, typer.Option(help=f"Backbone, instead of --extractor: {', '.join(BACKBONES)}.")
-    ] = None,
     checkpoint: Annotated[
         Path | None,
         typer.Option(
@@ -62,24 +45,6 @@ def describe(
     weights: Annotated[
         Path | None,
         typer.Option(help="DINOv2 weights: .pth, .pt or .safetensors."),
-    ] = None,
-    layer: Annotated[int | None, typer.Option(help="Transformer block, counted from 0.")] = None,
-    facet: Annotated[
-        str | None, typer.Option(help=f"Facet of the transformer layer: {', '.join(FACETS)}.")
-    ] = None,
-    preprocessing: Annotated[
-        str | None,
-        typer.Option(
-            help=f"Resizing and cropping: {', '.join(PREPROCESSING_NAMES)}. "
-            "Default: the extractor's own."
-        ),
-    ] = None,
-    aggregator: Annotated[
-        str | None,
-        typer.Option(help=f"Aggregation of patch features: {', '.join(EXTRACTOR_AGGREGATORS)}."),
-    ] = None,
-    temperature: Annotated[
-        float | None, typer.Option(help="Softmax temperature of soft-vlad. Default: 1.")
     ] = None,
     vocabulary: Annotated[
         Path | None,
@@ -117,26 +82,13 @@ def describe(
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     names = _hdf5_names(photos, out, root)
     settings = read_settings()
-    chosen = {"--checkpoint": checkpoint, "--extractor": extractor, "--backbone": backbone}
-    if len(given := [option for option, value in chosen.items() if value is not None]) > 1:
-        raise InvalidRequest("options_contradict", f"{' and '.join(given)} exclude each other.")
     if checkpoint is not None:
-        extractor = f"gsv:{checkpoint.absolute()}"
-    elif backbone is not None:
-        if backbone not in BACKBONES:
+        if extractor is not None:
             raise InvalidRequest(
-                "unknown_backbone",
-                f"Unknown backbone {backbone!r}. Available: {', '.join(BACKBONES)}.",
+                "options_contradict", "--checkpoint and --extractor exclude each other."
             )
-        extractor = BACKBONES[backbone]
-    options = {
-        "layer": layer,
-        "facet": facet,
-        "preprocessing": preprocessing,
-        "aggregator": aggregator,
-        "temperature": temperature,
-    }
-    name = add_extractor_options(extractor or settings.new_map_extractor, options)
+        extractor = f"gsv:{checkpoint.absolute()}"
+    name = extractor or settings.new_map_extractor
     config = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
     if weights is not None:
         if config.depth is None:

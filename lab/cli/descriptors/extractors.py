@@ -70,7 +70,7 @@ def load_own_vocabulary(config: ExtractorConfig, vocabulary: Path | None) -> Voc
         raise Misconfigured(
             "vocabulary_missing",
             f"The extractor {config.name} requires a vocabulary and ships none. Pass --vocabulary "
-            "FILE, or use --aggregator gem, which needs none.",
+            "FILE, or the option aggregator=gem, which needs none.",
         )
     return None
 

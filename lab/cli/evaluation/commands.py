@@ -42,8 +42,7 @@ RuleOption = Annotated[
     ),
 ]
 FaissGpuOption = Annotated[
-    bool,
-    typer.Option("--faiss-gpu", help="Run the nearest neighbour search on the GPU."),
+    bool, typer.Option("--faiss-gpu", help="Run the nearest neighbour search on the GPU.")
 ]
 
 SIZE_PATTERN = re.compile(r"([1-9][0-9]{1,3})[x ]([1-9][0-9]{1,3})")
@@ -128,7 +127,9 @@ def evaluate(
     queries: Annotated[Path | None, _existing_file("With --predictions: names of queries.")] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Output folder for predictions, metrics.json and report.html."),
+        typer.Option(
+            help="Output folder: predictions, metrics.json, report.html, tables, figures."
+        ),
     ] = None,
     against: Annotated[
         Path | None, _existing_folder("Compare with another run, given by its --out folder.")
@@ -203,27 +204,16 @@ def evaluate(
         "--fit-vocabulary": fit_vocabulary, "--protocol": protocol, "--rule": rule, "--rows": rows,
         "--place-labels-are-paths": place_labels_are_paths,
     }  # fmt: skip
-    file_options: OptionValues = {
-        "--ground-truth": ground_truth,
-        "--database": database,
-        "--queries": queries,
-    }
+    lists: OptionValues = {"--database": database, "--queries": queries}
+    file_options = lists | {"--ground-truth": ground_truth}
     output_options: OptionValues = {
         "--out": out, "--against": against, "--pairs": pairs, "--set": sets,
         "--sequences": sequences, "--kidnap-every": kidnap_every, "--recall-at": recall_at,
     }  # fmt: skip
     report_options = ReportOptions(
-        out,
-        against,
-        pairs,
-        depth,
-        _parse_recall_at(recall_at, depth),
-        grids,
-        only_wrong,
-        faiss_gpu,
-        place_labels_are_paths,
-        as_json,
-    )
+        out, against, pairs, depth, _parse_recall_at(recall_at, depth), grids, only_wrong,
+        faiss_gpu, place_labels_are_paths, as_json,
+    )  # fmt: skip
     # Must be set before torch is loaded below; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if predictions is not None:
@@ -254,7 +244,6 @@ def evaluate(
         evaluate_predictions(predictions, evaluation_set, report_options)
         return
     if data is not None:
-        lists: OptionValues = {"--database": database, "--queries": queries}
         _reject_options("with --data", map_options | lists)
         if ground_truth is not None:
             _reject_options("with --ground-truth", {"--rule": rule})
@@ -335,7 +324,7 @@ def compare(
         typer.Option(
             help="DIR: comma-separated extractor names with options as in EXTRACTOR, or "
             "checkpoints (.ckpt, .pth). `+fit` fits the VLAD vocabulary on the database photos; "
-            "`+pca512` reduces descriptors to 512 dimensions by PCA whitening.",
+            "`+pca512` reduces descriptors to 512 dimensions by PCA whitening."
         ),
     ] = None,
     set_name: Annotated[
@@ -344,7 +333,8 @@ def compare(
     protocol: ProtocolOption = None,
     rule: RuleOption = None,
     out: Annotated[
-        Path | None, typer.Option(help="Output folder for comparison.json and report.html.")
+        Path | None,
+        typer.Option(help="Output folder for table.csv, table.tex and a figure of recall@k."),
     ] = None,
     faiss_gpu: FaissGpuOption = False,
     extractor: Annotated[
@@ -385,12 +375,6 @@ def compare(
     from lab.cli.evaluation.compare_extractors import compare_extractors
 
     compare_extractors(
-        data,
-        extractors,
-        set_name=set_name,
-        protocol=protocol,
-        rule=rule,
-        out=out,
-        faiss_gpu=faiss_gpu,
-        as_json=as_json,
-    )
+        data, extractors, set_name=set_name, protocol=protocol, rule=rule, out=out,
+        faiss_gpu=faiss_gpu, as_json=as_json,
+    )  # fmt: skip

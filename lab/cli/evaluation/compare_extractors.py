@@ -5,10 +5,10 @@ An entry may reduce its descriptors by PCA whitening, which is fitted on the dat
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +17,15 @@ from rich.progress import Progress
 from rich.table import Column
 
 from lab.cli.evaluation.describers import checkpoint_describer, extractor_describer
+from lab.cli.evaluation.results import check_output_folders
 from lab.datasets.dataset import EvaluationSet
 from lab.datasets.open_dataset import open_evaluation_set
 from lab.evaluation.exact_knn import exact_knn
 from lab.evaluation.paired_runs import PairedDifference, paired_differences
 from lab.evaluation.query_clusters import cluster_queries
 from lab.evaluation.ranking import DEFAULT_KS, Rows, describe_evaluation_set
-from lab.evaluation.report.comparison import ComparedExtractor, pareto_front, render_comparison
+from lab.evaluation.report.charts import recall_comparison
+from lab.evaluation.report.tables import write_figures, write_tables
 from lab.evaluation.results import package_versions
 from lab.evaluation.retrieval_metrics import RetrievalMetrics, compute_metrics
 from services.cli.environment import read_settings
@@ -32,7 +34,6 @@ from services.cli.output import (
     print_json,
     print_message,
     print_table,
-    printable_path,
     progress_bar,
     refuse_unwritable,
     stage_bars,
@@ -137,6 +138,56 @@ def _parse_entry(spec_text: str) -> ComparisonEntry:
     return ComparisonEntry(spec_text, name, fit, pca)
 
 
+@dataclass(frozen=True, slots=True)
+class ComparedExtractor:
+    """Metrics and costs of one extractor of a comparison."""
+
+    name: str
+    measured: RetrievalMetrics
+    difference: PairedDifference | None
+    """R@1 of this extractor minus R@1 of the first; None for the first"""
+    dimension: int
+    bytes_a_photo: int
+    milliseconds_a_photo: float | None
+    """None if not measured"""
+    fingerprint: str
+    device: str
+
+    def against_first(self) -> str:
+        """Format the difference from the first extractor in percentage points, with interval."""
+        if self.difference is None:
+            return ""
+        mean = f"{100 * self.difference.mean:+.1f}"
+        interval = self.difference.interval_in_points()
+        return mean if interval is None else f"{mean} ({interval})"
+
+    def table_cells(self) -> list[str]:
+        """Format recalls, interval of R@1, time, size and difference for a table."""
+        interval = self.measured.recall_intervals
+        milliseconds = self.milliseconds_a_photo
+        return [
+            *(f"{100 * recall:.1f}" for recall in self.measured.recalls.recall_all.values()),
+            interval[0].as_percent() if interval else "-",
+            "-" if milliseconds is None else f"{milliseconds:.1f}",
+            f"{self.bytes_a_photo:,}",
+            self.against_first(),
+        ]
+
+    def as_json(self) -> dict[str, Any]:
+        metrics = self.measured.as_json()
+        names = ("recall", "recall_interval", "recall_findable", "mean_average_precision")
+        return {
+            "extractor": self.name,
+            "fingerprint": self.fingerprint,
+            "device": self.device,
+            "dimension": self.dimension,
+            "bytes_a_photo": self.bytes_a_photo,
+            "milliseconds_a_photo": self.milliseconds_a_photo,
+            **{name: metrics[name] for name in (*names, "intervals")},
+            "against_first": self.difference.as_json() if self.difference else None,
+        }
+
+
 def compare_extractors(
     data: Path,
     extractors: str,
@@ -148,14 +199,15 @@ def compare_extractors(
     faiss_gpu: bool,
     as_json: bool,
 ) -> None:
-    """Evaluate each extractor on a data set, then print and write the comparison.
+    """Evaluate each extractor on a data set, then write and print the comparison.
 
     Raises InvalidRequest (`bad_extractors`), Misconfigured (`out_unwritable`), Unprocessable (a
     photo can't be described), and errors of opening the data set and loading the extractors.
     """
     entries = parse_entries(extractors)
     settings = read_settings()
-    _validate_entries(entries, settings, out)
+    _validate_entries(entries, settings)
+    check_output_folders(out)
     evaluation_set = open_evaluation_set(data, set_name, protocol=protocol, rule=rule)
     clusters = cluster_queries(evaluation_set.queries)
     compared: list[ComparedExtractor] = []
@@ -171,24 +223,18 @@ def compare_extractors(
                     measured.within[:, :1], first.within[:, :1], clusters.labels
                 )
             compared.append(ComparedExtractor(entry.spec_text, measured, difference, **properties))
-    report = _comparison_as_json(evaluation_set, compared)
     if out is not None:
-        text = json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+        measured_by_name = [(each.name, each.measured) for each in compared]
         with refuse_unwritable(out):
-            (out / "comparison.json").write_text(text, encoding="utf-8")
-            page = render_comparison(evaluation_set, compared)
-            (out / "report.html").write_text(page, encoding="utf-8")
+            write_tables(out, measured_by_name)
+            write_figures(out, evaluation_set.name, [recall_comparison(measured_by_name)])
     if as_json:
-        print_json(report)
-        return
-    _print_comparison(evaluation_set, compared)
-    if out is not None:
-        print_message(printable_path(out / "report.html"))
+        print_json(_comparison_as_json(evaluation_set, compared))
+    else:
+        _print_comparison(evaluation_set, compared)
 
 
-def _validate_entries(
-    entries: Sequence[ComparisonEntry], settings: Settings, out: Path | None
-) -> None:
+def _validate_entries(entries: Sequence[ComparisonEntry], settings: Settings) -> None:
     """Check all entries before the first evaluation, which may take hours."""
     for entry in entries:
         if entry.name.endswith(CHECKPOINT_SUFFIXES):
@@ -206,9 +252,6 @@ def _validate_entries(
             raise InvalidRequest(
                 "bad_extractors", f"{entry.spec_text}: {config.name} uses no vocabulary."
             )
-    if out is not None:
-        with refuse_unwritable(out):
-            out.mkdir(parents=True, exist_ok=True)
 
 
 def _evaluate_entry(
@@ -226,13 +269,9 @@ def _evaluate_entry(
         )
     )
     on_progress = stage_bars(progress, f"{entry.spec_text}: ")
-    describer.describe.on_lookup = lambda done, total: on_progress(
-        "cached descriptors", done, total
-    )
-    with describe_evaluation_set(describer.describe, evaluation_set, on_progress=on_progress) as (
-        database,
-        queries,
-    ):
+    describer.describe.on_lookup = partial(on_progress, "cached descriptors")
+    with describe_evaluation_set(describer.describe, evaluation_set, on_progress) as rows:
+        database, queries = rows
         milliseconds = describer.describe.milliseconds_a_photo()
         if entry.pca is not None:
             database, queries, projection_ms = whiten_set(
@@ -240,13 +279,9 @@ def _evaluate_entry(
             )
             if milliseconds is not None:
                 milliseconds += projection_ms
-        ranked = exact_knn(
-            queries,
-            database,
-            max(DEFAULT_KS),
-            faiss_gpu=faiss_gpu,
-            on_progress=lambda done, total: on_progress("search", done, total),
-        )
+        search = partial(on_progress, "search")
+        depth = max(DEFAULT_KS)
+        ranked = exact_knn(queries, database, depth, faiss_gpu=faiss_gpu, on_progress=search)
         dimension = database.shape[1]
     measured = compute_metrics(
         ranked.indices,
@@ -266,19 +301,13 @@ def _evaluate_entry(
 def _comparison_as_json(
     evaluation_set: EvaluationSet, compared: Sequence[ComparedExtractor]
 ) -> dict[str, Any]:
-    recalls = [result.recall_at_1 for result in compared]
-    by_size = pareto_front([result.bytes_a_photo for result in compared], recalls)
-    by_time = pareto_front([result.milliseconds for result in compared], recalls)
     return {
         "set": evaluation_set.name,
         "protocol": evaluation_set.protocol,
         "rule": evaluation_set.rule,
         "fingerprint": evaluation_set.fingerprint,
         "versions": package_versions(),
-        "extractors": [
-            {**result.as_json(), "pareto_by_size": size, "pareto_by_time": duration}
-            for result, size, duration in zip(compared, by_size, by_time, strict=True)
-        ],
+        "extractors": [result.as_json() for result in compared],
     }
 
 

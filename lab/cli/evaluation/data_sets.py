@@ -35,12 +35,7 @@ from lab.evaluation.ranking import (
     describe_to_matrix,
     refused_photos_error,
 )
-from lab.evaluation.results import (
-    EvaluationResult,
-    EvaluationRun,
-    load_matrix,
-    read_comparable_run,
-)
+from lab.evaluation.results import EvaluationResult, EvaluationRun, load_matrix, read_comparable_run
 from placewise.answers import Similar, Uploaded
 from placewise.client import Client
 from services.cli.client import active_generation, connect
@@ -244,7 +239,7 @@ def evaluate_sets(
             "--place-labels-are-paths requires --checkpoint, --extractor or --rows: with --server, "
             "levels are not measured. To measure those of a map: placewise evaluate --map NAME.",
         )
-    check_output_folders(options)
+    check_output_folders(options.out, options.pairs)
     settings = read_settings()
     set_names = names or evaluation_set_names(data)
     if not set_names:
@@ -323,17 +318,10 @@ def _evaluate_describer(
     progress: Progress,
 ) -> EvaluationResult:
     on_progress = stage_bars(progress, f"{evaluation_set.name}: ")
-    describer.describe.on_lookup = lambda done, total: on_progress(
-        "cached descriptors", done, total
-    )
-    with describe_evaluation_set(describer.describe, evaluation_set, on_progress=on_progress) as (
-        database,
-        queries,
-    ):
+    describer.describe.on_lookup = functools.partial(on_progress, "cached descriptors")
+    with describe_evaluation_set(describer.describe, evaluation_set, on_progress) as rows:
         milliseconds = describer.describe.milliseconds_a_photo()
-        return _evaluate_rows(
-            evaluation_set, database, queries, options, settings, progress, milliseconds
-        )
+        return _evaluate_rows(evaluation_set, *rows, options, settings, progress, milliseconds)
 
 
 def _evaluate_rows(
@@ -350,13 +338,8 @@ def _evaluate_rows(
     scheme = LevelScheme(
         labels_are_paths=options.place_labels_are_paths, radii_m=settings.level_radii_m
     )
-    ranked = exact_knn(
-        queries,
-        database,
-        max(options.depth, EVIDENCE_DEPTH),
-        faiss_gpu=options.faiss_gpu,
-        on_progress=lambda done, total: on_progress("search", done, total),
-    )
+    depth, search = max(options.depth, EVIDENCE_DEPTH), functools.partial(on_progress, "search")
+    ranked = exact_knn(queries, database, depth, faiss_gpu=options.faiss_gpu, on_progress=search)
     places = measure_places(evaluation_set, database, ranked, scheme, settings.estimate_radius_m)
     figures: dict[str, Any] = {
         "dimension": database.shape[1],

@@ -17,7 +17,7 @@ from lab.datasets.photo_lists import read_photo_list
 from lab.evaluation.exact_knn import Rankings
 from lab.evaluation.query_clusters import cluster_queries, singleton_clusters
 from lab.evaluation.ranking import DEFAULT_KS
-from lab.evaluation.report.page import render_report
+from lab.evaluation.report.page import write_report
 from lab.evaluation.results import (
     EvaluationResult,
     EvaluationRun,
@@ -44,17 +44,14 @@ from shared.errors import InvalidRequest
 from shared.evaluation.bootstrap import ConfidenceInterval
 
 
-def check_output_folders(options: ReportOptions) -> None:
+def check_output_folders(out: Path | None, pairs: Path | None = None) -> None:
     """Create the output folders before the long computation of results.
 
     Raises Misconfigured: `out_unwritable`.
     """
-    if options.out is not None:
-        with refuse_unwritable(options.out):
-            options.out.mkdir(parents=True, exist_ok=True)
-    if options.pairs is not None:
-        with refuse_unwritable(options.pairs):
-            options.pairs.parent.mkdir(parents=True, exist_ok=True)
+    for folder in filter(None, (out, pairs and pairs.parent)):
+        with refuse_unwritable(folder):
+            folder.mkdir(parents=True, exist_ok=True)
 
 
 def evaluate_rankings(
@@ -105,10 +102,7 @@ def output_results(
     if options.out is not None:
         with refuse_unwritable(options.out):
             write_run_files(options.out, run, results)
-            report = render_report(
-                run, results, grids_shown=options.grids, only_wrong=options.only_wrong
-            )
-            (options.out / "report.html").write_text(report, encoding="utf-8")
+            write_report(options.out, run, results, options.grids, options.only_wrong)
     if options.pairs is not None:
         with refuse_unwritable(options.pairs):
             write_pairs(options.pairs, results)
@@ -188,7 +182,7 @@ def evaluate_predictions(
         InvalidRequest: Errors of reading the predictions.
         Misconfigured: `out_unwritable`.
     """
-    check_output_folders(options)
+    check_output_folders(options.out, options.pairs)
     ranked = read_predictions(predictions)
     check_predictions(
         predictions, ranked, evaluation_set.positives, len(evaluation_set.database) or None

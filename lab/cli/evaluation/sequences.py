@@ -41,7 +41,6 @@ from shared.tracks.motion import MotionModel
 METHODS = {
     "single": "single frames",
     "seqslam": "SeqSLAM, constant velocity",
-    "hmm": "hidden Markov model",
     "filter": "filter",
     "smoothed": "filter, forward and backward",
 }
@@ -100,9 +99,7 @@ def _evaluate_set(
 ) -> Json:
     describer = make_describer(evaluation_set, target, read_settings(), progress)
     on_progress = stage_bars(progress, f"{evaluation_set.name}: ")
-    with describe_evaluation_set(
-        describer.describe, evaluation_set, on_progress=on_progress
-    ) as matrices:
+    with describe_evaluation_set(describer.describe, evaluation_set, on_progress) as matrices:
         database, queries = (_normalise(rows) for rows in matrices)
     map_ = prepare_map(evaluation_set, database, motion)
     sequences: list[list[FrameResult]] = []

@@ -1,4 +1,4 @@
-"""Renders the HTML reports of evaluations and comparisons from the folder `templates`.
+"""Renders the HTML reports of evaluations from the folder `templates`.
 
 A report is one file: its charts and photos are inside, and it fetches nothing.
 """
@@ -20,45 +20,44 @@ from lab.evaluation.report.charts import (
     reliability_chart,
 )
 from lab.evaluation.report.retrieval_grids import changed_grids, retrieval_grids
+from lab.evaluation.report.tables import write_figures, write_tables
 from lab.evaluation.results import EvaluationResult, EvaluationRun, package_versions
 from shared.evaluation.bootstrap import ConfidenceInterval
 
 
-def render_report(
+def write_report(
+    out: Path,
     run: EvaluationRun,
     results: Sequence[EvaluationResult],
-    *,
-    grids_shown: int = 12,
-    only_wrong: bool = False,
-) -> str:
-    """Render the report of a run.
+    grids_shown: int,
+    only_wrong: bool,
+) -> None:
+    """Write the report of a run, `report.html`, its tables, and its charts as figures.
 
     Args:
         grids_shown: maximum number of queries per retrieval grid.
         only_wrong: omit the grid of correct queries.
     """
-    return render_page(
-        "evaluation.html",
+    sections: list[dict[str, Any]] = []
+    for result in results:
+        charts = recall_chart(result), precision_chart(result), distance_chart(result)
+        levels = result.places and reliability_chart(result.places["levels"])
+        positions = positions_chart(result)
+        sections.append({
+            "result": result, "charts": charts, "levels_chart": levels, "map": positions,
+            "changed_grids": changed_grids(result, grids_shown),
+            "grids": retrieval_grids(result, grids_shown, only_wrong=only_wrong),
+        })  # fmt: skip
+        drawn = (*charts, levels or None, positions and positions[0])
+        write_figures(out, result.evaluation_set.name, drawn)
+    write_tables(out, [(each.evaluation_set.name, each.measured) for each in results])
+    page = _templates.get_template("evaluation.html").render(
         title=f"Evaluation of {run.name}",
         about={"model": run.name, "fingerprint": run.fingerprint or "unknown", **run.about},
         versions=", ".join(f"{name} {number}" for name, number in package_versions().items()),
-        sections=[
-            {
-                "result": result,
-                "charts": (recall_chart(result), precision_chart(result), distance_chart(result)),
-                "levels_chart": result.places and reliability_chart(result.places["levels"]),
-                "map": positions_chart(result),
-                "changed_grids": changed_grids(result, grids_shown),
-                "grids": retrieval_grids(result, grids_shown, only_wrong=only_wrong),
-            }
-            for result in results
-        ],
+        sections=sections,
     )
-
-
-def render_page(template: str, **values: Any) -> str:
-    """Render a page of the folder `templates`."""
-    return _templates.get_template(template).render(**values)
+    (out / "report.html").write_text(page, encoding="utf-8")
 
 
 def _format_share(
@@ -85,8 +84,4 @@ _templates = Environment(
     lstrip_blocks=True,
     undefined=StrictUndefined,
 )
-_templates.filters |= {
-    "share": _format_share,
-    "percent": _format_percent,
-    "number": _format_number,
-}
+_templates.filters |= {"share": _format_share, "percent": _format_percent, "number": _format_number}

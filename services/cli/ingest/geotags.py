@@ -71,6 +71,10 @@ class LocalPhoto:
             return self.path.open("rb")
         return io.BytesIO(self.archived.read())
 
+    def content(self) -> Path | BinaryIO:
+        """Return the file, or open what is not a file of its own. Raises what `open` raises."""
+        return self.path if self.archived is None else self.open()
+
 
 def find_local_sources(sources: Sequence[str]) -> list[Path] | None:
     """Expand patterns, and return the folders, photos and archives; None if a source is none.

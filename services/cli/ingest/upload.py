@@ -193,7 +193,7 @@ def _upload_concurrently(
         for photo in photos:
             try:
                 # In the order of the archive, and only a few ahead: they are read into memory.
-                content = photo.path if photo.archived is None else photo.open()
+                content = photo.content()
             except PlacewiseError as error:
                 yield photo, error
                 continue

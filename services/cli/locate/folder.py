@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import astuple, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from xml.etree import ElementTree
@@ -19,31 +19,30 @@ from services.cli.ingest.local_headers import (
     read_local_header,
     read_sidecar,
 )
+from services.cli.locate.library import LibraryPhoto
 from services.cli.output import printable_path, utf8_path
 from shared.errors import InvalidRequest
-from shared.geotagging.evidence import DatedPhoto, KnownPosition, add_time_zones
+from shared.geotagging.evidence import KnownPosition, add_time_zones
 from shared.imaging.capture_place import is_null_island
 from shared.imaging.photo_header import PhotoHeader
 
 
-@dataclass(frozen=True, slots=True)
-class FolderPhoto(DatedPhoto):
-    """A photo of the folder; its coordinates are of the EXIF, of XMP in it, or of its sidecar."""
-
-    path: Path = field(kw_only=True)
-    gps_error: str | None = field(kw_only=True)
-    """why it may have coordinates although none are known"""
-
-    @property
-    def is_unlocated(self) -> bool:
-        """Whether the photo certainly has no coordinates."""
-        return self.latitude is None and self.gps_error is None
-
-
 def read_folder(
     folder: Path, time_zone: str | None, clock_offset_seconds: float
-) -> list[FolderPhoto]:
-    """Read the photos below a folder, sorted by path.
+) -> list[LibraryPhoto]:
+    """Read the photos below a folder, sorted by path. Their id is the path in the folder.
+
+    Raises:
+        InvalidRequest: `no_photos`, `bad_time_zone`.
+    """
+    photos = [read_photo(folder, path) for path in list_photos(folder)]
+    return set_clocks(photos, time_zone, clock_offset_seconds)
+
+
+def set_clocks(
+    photos: Sequence[LibraryPhoto], time_zone: str | None, clock_offset_seconds: float
+) -> list[LibraryPhoto]:
+    """Complete the time zones of the cameras' clocks, and correct a wrong clock.
 
     Args:
         time_zone: Zone of times without one, such as `+02:00` or `Europe/Paris`.
@@ -51,22 +50,23 @@ def read_folder(
             without coordinates.
 
     Raises:
-        InvalidRequest: `no_photos`, `bad_time_zone`.
+        InvalidRequest: `bad_time_zone`.
     """
     zone = parse_time_zone(time_zone) if time_zone else None
-    read = add_time_zones([read_photo(folder, path) for path in list_photos(folder)])
-    photos = [photo if zone is None else in_time_zone(photo, zone) for photo in read]
+    zoned = [
+        photo if zone is None else in_time_zone(photo, zone) for photo in add_time_zones(photos)
+    ]
     ahead = timedelta(seconds=clock_offset_seconds)
-    unlocated = {photo.camera for photo in photos if photo.is_unlocated}
+    unlocated = {photo.camera for photo in zoned if photo.is_unlocated}
     return [
         replace(photo, time=move_time(photo.time, lambda time: time - ahead))
         if photo.camera in unlocated
         else photo
-        for photo in photos
+        for photo in zoned
     ]
 
 
-def check_time_zones(photos: Sequence[FolderPhoto], why: str) -> None:
+def check_time_zones(photos: Sequence[LibraryPhoto], why: str) -> None:
     """Check that all times have a zone.
 
     Raises:
@@ -114,12 +114,27 @@ def read_gpx(path: Path) -> list[KnownPosition]:
     return sorted(points, key=lambda point: point.time)
 
 
-def read_photo(folder: Path, path: Path) -> FolderPhoto:
+def read_photo(folder: Path, path: Path) -> LibraryPhoto:
     """Read the header of a photo and its sidecars."""
+    size, modified_ns = _file_state(path)  # before its content
     sidecars = [read_sidecar(sidecar) for sidecar in find_sidecars(path)]
     header = PhotoHeader(0, 0)
     # The search names what is wrong with a photo that can't be read.
     with contextlib.suppress(OSError), path.open("rb") as file:
         header = read_local_header(file, sidecars)
     dated = dated_photo(utf8_path(path.relative_to(folder)), header)
-    return FolderPhoto(*astuple(dated), path=path, gps_error=header.gps_error)
+    return LibraryPhoto(
+        *astuple(dated),
+        id=str(path.relative_to(folder)),
+        state=f"{size} {modified_ns}",
+        gps_error=header.gps_error,
+    )
+
+
+def _file_state(path: Path) -> tuple[int, int]:
+    """Return size in bytes and modification time in ns; zeros for a file that is gone."""
+    try:
+        status = path.stat()
+    except OSError:
+        return 0, 0
+    return status.st_size, status.st_mtime_ns

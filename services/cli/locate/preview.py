@@ -1,6 +1,6 @@
-"""The last searches of a folder, kept so that `--write` writes what the preview has shown.
+"""The last searches of a library, kept so that `--write` writes what the preview has shown.
 
-They are a file below PLACEWISE_HOME, because a preview writes nothing into the folder itself. The
+They are a file below PLACEWISE_HOME, because a preview writes nothing into a folder itself. The
 map may have changed between the two, or an evaluation may have ended: another search would give
 other proposals, and repeat minutes of work.
 """
@@ -16,6 +16,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
+from services.cli.locate.library import LibraryPhoto
 from services.cli.output import refuse_unwritable
 from shared.config.private_files import make_private_folder, write_private
 from shared.geotagging.evidence import PictureEvidence
@@ -37,35 +38,26 @@ class SearchedPhoto:
 
 @dataclass(frozen=True, slots=True)
 class Preview:
-    """The searches of a folder's photos and the proposals that were accepted."""
+    """The searches of a library's photos and the proposals that were accepted."""
 
     searched_at: datetime
-    searches: Mapping[str, tuple[int, int, SearchedPhoto]]
-    """by name: size in bytes and modification time in ns of the file, and its search"""
+    searches: Mapping[str, tuple[str, SearchedPhoto]]
+    """by name: state of the photo, and its search"""
     accepted: Mapping[str, Sequence[float | str]]
     """by name: latitude, longitude and place, as far as they are known"""
 
-    def search_of(self, name: str, photo: Path) -> SearchedPhoto | None:
-        """Return the search of a photo whose file has not changed since."""
-        size, modified_ns, searched = self.searches.get(name, (0, 0, None))
-        return searched if (size, modified_ns) == file_state(photo) else None
+    def search_of(self, photo: LibraryPhoto) -> SearchedPhoto | None:
+        """Return the search of a photo that has not changed since."""
+        state, searched = self.searches.get(photo.name, ("", None))
+        return searched if state == photo.state else None
 
 
 PREVIEW = TypeAdapter(Preview)
 
 
-def file_state(path: Path) -> tuple[int, int]:
-    """Return size in bytes and modification time in ns; zeros for a file that is gone."""
-    try:
-        status = path.stat()
-    except OSError:
-        return 0, 0
-    return status.st_size, status.st_mtime_ns
-
-
-def preview_file(home: Path, folder: Path, server: str | None, map_name: str | None) -> Path:
-    """Return the file of a folder's preview with a map of a server; None is the default one."""
-    key = json.dumps([str(folder.resolve()), server, map_name])
+def preview_file(home: Path, identity: str, server: str | None, map_name: str | None) -> Path:
+    """Return the file of a library's preview with a map of a server; None is the default one."""
+    key = json.dumps([identity, server, map_name])
     return home / "locate" / f"{hashlib.sha256(key.encode()).hexdigest()}.json"
 
 

@@ -14,30 +14,19 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from filelock import FileLock, Timeout
 
-from services.cli.output import printable_path
+from services.cli.locate.library import UndoReport
+from services.cli.output import Json, printable_path
 from shared.errors import Conflict, Misconfigured, NotFound, Unprocessable
 from shared.ids import new_id
 
 FOLDER = ".placewise-locate"
 JOURNAL, BACKUPS, STAGED = "journal.jsonl", "before", "new"
-
-
-@dataclass(frozen=True, slots=True)
-class UndoReport:
-    """What `undo` has done; paths are relative to the folder."""
-
-    restored: list[str]
-    removed: list[str]
-    changed_since: list[str]
-    """files that something else has changed since; they are left as they are"""
 
 
 class UndoJournal:
@@ -50,8 +39,7 @@ class UndoJournal:
         for name in (BACKUPS, STAGED):
             (self._folder / name).mkdir(exist_ok=True)
         lines = _read_lines(self._journal)
-        # Without an incomplete last line, which a killed process has left.
-        _write_synced(self._journal, b"".join(_to_line(line) for line in lines))
+        repair_journal(self._journal, lines)
         self._read: dict[Path, str | None] = {}  # staged file -> SHA-256 of the file it is made of
         self._known: dict[str, set[str | None]] = {}  # path -> SHA-256 of what undo may discard
         for line in lines:
@@ -93,15 +81,12 @@ class UndoJournal:
             line["backup"] = str(new_id())  # a name that no earlier backup has
             _link_or_copy(path, self._folder / BACKUPS / str(line["backup"]))
             _sync(self._folder / BACKUPS)
-        with self._journal.open("ab") as file:
-            file.write(_to_line(line))
-            file.flush()
-            os.fsync(file.fileno())
+        append_to_journal(self._journal, line)
         self._remember(line)
         staged.replace(path)
         _sync(path.parent)
 
-    def _remember(self, line: dict[str, Any]) -> None:
+    def _remember(self, line: Json) -> None:
         self._known.setdefault(line["path"], set()).update((line["before"], line["after"]))
 
 
@@ -132,9 +117,9 @@ def undo(root: Path) -> UndoReport:
     folder = root / FOLDER
     if not (folder / JOURNAL).exists():
         raise NotFound("nothing_to_undo", f"{printable_path(root)} has no journal of changes.")
-    report = UndoReport([], [], [])
+    report = UndoReport()
     with _exclusive(root):
-        originals: dict[str, dict[str, Any]] = {}
+        originals: dict[str, Json] = {}
         written: dict[str, set[str]] = {}
         for line in _read_lines(folder / JOURNAL):
             if line["backup"] is not None:
@@ -188,22 +173,54 @@ def _exclusive(root: Path) -> Iterator[None]:
         ) from error
 
 
-def _read_lines(journal: Path) -> list[dict[str, Any]]:
-    """Return the lines of a journal; an incomplete last line stands for no change."""
+def _read_lines(journal: Path) -> list[Json]:
+    return [
+        {key: line[key] for key in ("path", "before", "after", "backup")}
+        for line in read_journal(journal, _check_line)
+    ]
+
+
+def _check_line(line: Json) -> None:
+    paths = [line["path"], *([line["backup"]] if line["backup"] is not None else [])]
+    if not all(isinstance(path, str) for path in paths) or "/" in "".join(paths[1:]):
+        raise ValueError
+    _ = line["before"], line["after"]
+
+
+def read_journal(journal: Path, check: Callable[[Json], object]) -> list[Json]:
+    """Return the lines of a journal; an incomplete last line stands for no change.
+
+    Args:
+        check: Raises ValueError, KeyError or TypeError for a line of another form.
+
+    Raises:
+        Unprocessable: `journal_damaged`.
+    """
     data = journal.read_bytes() if journal.exists() else b""
-    lines = []
+    lines: list[Json] = []
     for number, text in enumerate(data.split(b"\n")[:-1], start=1):
         try:
             line = json.loads(text)
-            paths = [line["path"], *([line["backup"]] if line["backup"] is not None else [])]
-            if not all(isinstance(path, str) for path in paths) or "/" in "".join(paths[1:]):
-                raise ValueError
-            lines.append({key: line[key] for key in ("path", "before", "after", "backup")})
+            check(line)
         except (ValueError, KeyError, TypeError) as error:
             raise Unprocessable(
                 "journal_damaged", f"{printable_path(journal)}: line {number} can't be read."
             ) from error
+        lines.append(line)
     return lines
+
+
+def repair_journal(journal: Path, lines: Sequence[Json]) -> None:
+    """Take away an incomplete last line, which a killed process has left."""
+    _write_synced(journal, b"".join(_to_line(line) for line in lines))
+
+
+def append_to_journal(journal: Path, line: Json) -> None:
+    """Append a line, which is on the disk when the call returns."""
+    with journal.open("ab") as file:
+        file.write(_to_line(line))
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _check_is_below(root: Path, name: str) -> None:
@@ -216,7 +233,7 @@ def _check_is_below(root: Path, name: str) -> None:
         )
 
 
-def _to_line(line: dict[str, Any]) -> bytes:
+def _to_line(line: Json) -> bytes:
     # File names that are no UTF-8 are read back as they were.
     return json.dumps(line).encode() + b"\n"
 

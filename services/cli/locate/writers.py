@@ -1,4 +1,4 @@
-"""Writes accepted proposals: XMP sidecars, EXIF, a CSV table or GPX waypoints.
+"""A folder as a library, and what is written: XMP sidecars, EXIF, a CSV table or GPX waypoints.
 
 EXIF is written by the program exiftool.
 """
@@ -12,16 +12,17 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
 from services.cli.ingest.local_headers import find_sidecars
-from services.cli.locate.folder import FolderPhoto, read_photo
+from services.cli.locate.folder import read_folder, read_photo
+from services.cli.locate.library import LibraryPhoto, LocatedPhoto, UndoReport, WriteReport
 from services.cli.locate.sidecars import METHOD, TRUE_NORTH, add_position, sidecar_path
-from services.cli.locate.undo_journal import UndoJournal, open_journal
+from services.cli.locate.undo_journal import UndoJournal, open_journal, undo
 from services.cli.output import utf8_path
 from shared.errors import Misconfigured, PlacewiseError, Unprocessable
 from shared.geotagging.fusion import Proposal
@@ -41,40 +42,34 @@ class Target(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class LocatedPhoto:
-    """The proposal for a photo without coordinates."""
+class FolderLibrary:
+    """The photos below a folder; implements `PhotoLibrary`."""
 
-    photo: FolderPhoto
-    proposal: Proposal | None
-    place: str | None
-    """finest label of the estimate"""
-    place_probability: float | None
-    error: str | None
-    """why the photo could not be searched"""
-    why_unknown: str = ""
-    """what is shown if there is no proposal"""
+    folder: Path
+    target: Target
+    time_zone: str | None = None
+    clock_offset_seconds: float = 0.0
 
     @property
-    def probability(self) -> float:
-        """Of the position, or of the place if there is none."""
-        if self.proposal is not None:
-            return self.proposal.probability
-        return self.place_probability or 0.0
+    def identity(self) -> str:
+        """The absolute path."""
+        return str(self.folder.resolve())
 
-    def shown(self) -> list[float | str]:
-        """Return coordinates and place, as far as they are known, rounded as they are shown."""
-        found = self.proposal
-        coordinates = [round(found.latitude, 6), round(found.longitude, 6)] if found else []
-        return [*coordinates, *([self.place] if self.place else [])]
+    def list_photos(self) -> Sequence[LibraryPhoto]:
+        """Raises InvalidRequest: `no_photos`, `bad_time_zone`."""
+        return read_folder(self.folder, self.time_zone, self.clock_offset_seconds)
 
+    def fetch(self, photo: LibraryPhoto) -> Path:
+        """Return the file."""
+        return self.folder / photo.id
 
-@dataclass(frozen=True, slots=True)
-class WriteReport:
-    """What was written; paths are relative to the folder."""
+    def write(self, located: Sequence[LocatedPhoto]) -> WriteReport:
+        """Write into the target; see `write_locations`."""
+        return write_locations(self.folder, self.target, located)
 
-    written: list[str] = field(default_factory=list)
-    skipped: dict[str, str] = field(default_factory=dict)
-    """reasons by photo"""
+    def undo(self) -> UndoReport:
+        """Restore the files; see `undo_journal.undo`."""
+        return undo(self.folder)
 
 
 def write_locations(folder: Path, target: Target, locations: Sequence[LocatedPhoto]) -> WriteReport:
@@ -104,12 +99,12 @@ def write_locations(folder: Path, target: Target, locations: Sequence[LocatedPho
             report.written.append(name)
         else:
             for location, proposal in positions:
-                name = location.photo.name
-                if reason := _change_meanwhile(folder, location.photo.path):
+                name, photo = location.photo.name, folder / location.photo.id
+                if reason := _change_meanwhile(folder, photo):
                     report.skipped[name] = reason
                     continue
                 try:
-                    path = write_one(journal, location.photo.path, proposal)
+                    path = write_one(journal, photo, proposal)
                 except PlacewiseError as error:
                     report.skipped[name] = error.detail
                 except OSError as error:

@@ -17,6 +17,7 @@ from services.cli.environment import read_settings
 from services.cli.output import (
     JsonOption,
     err_console,
+    first_names,
     print_json,
     print_message,
     print_note,
@@ -139,6 +140,4 @@ def print_recovered(report: RecoveryReport) -> None:
         ("originals can't be decoded and were not recovered", report.unreadable_originals),
     ):
         if keys:
-            listed = ", ".join(keys[:MAX_KEYS_SHOWN])
-            listed += " ..." if len(keys) > MAX_KEYS_SHOWN else ""
-            print_note(f"{len(keys)} {problem}: {listed}")
+            print_note(f"{len(keys)} {problem}: {first_names(keys, MAX_KEYS_SHOWN)}")

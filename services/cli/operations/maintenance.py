@@ -20,26 +20,24 @@ from services.cli.recovery.backup import (
     BackupProgress,
     create_backup,
 )
-from services.steward.tasks.orphans import StoreCount, collect_orphans, count_store, find_orphans
+from services.steward.tasks.orphans import StoreCount, collect_orphans, find_orphans
 from shared.catalog.database.schema import check_schema, migrate, opening
 from shared.catalog.database.session import NO_TIMEOUTS, Catalog
 from shared.catalog.installation import (
-    adopt_store,
-    check_not_behind,
     get_or_create_installation,
     open_installation_store,
 )
 from shared.catalog.tables import open_catalog
 from shared.config.embedded_home import lock_home
 from shared.config.settings import Settings
-from shared.errors import Conflict, Misconfigured
+from shared.errors import Misconfigured
 from shared.integrity.verify import IntegrityReport, repair_descriptors, verify_store
 from shared.jobs import InProcessWakeups
 from shared.storage import OwnedStore
 from shared.storage.keys import TRASH
 from shared.storage.open_store import open_store
 from shared.storage.ownership import read_owner
-from shared.storage.trash import Hold, HoldReason, read_hold, restore_trash, write_hold
+from shared.storage.trash import read_hold, restore_trash
 from shared.telemetry.logs import configure_logging
 
 if TYPE_CHECKING:
@@ -132,43 +130,7 @@ def verify_storage(
     return report, queued
 
 
-def adopt_storage(settings: Settings, *, confirm: bool) -> StoreCount:
-    """Count the store's objects and orphans; with `confirm`, make this catalog its owner."""
-    with contextlib.ExitStack() as stack:
-        if settings.database_url is None:
-            stack.enter_context(lock_home(settings.placewise_home))
-        catalog = stack.enter_context(
-            contextlib.closing(open_catalog(settings, "storage", NO_TIMEOUTS))
-        )
-        store = open_store(settings, exclusive=False)
-        store.check()
-        if confirm and catalog.is_sqlite:
-            migrate(catalog)
-        is_new = catalog.is_sqlite and not Path(catalog.url.database or "").exists()
-        if not is_new:
-            check_schema(catalog)
-            _check_not_owned(catalog, store)
-        count = count_store(None if is_new else catalog, store)
-        unknown = count.orphans.total()
-        if confirm:
-            # The hold comes first: without it, this catalog's steward could collect the objects.
-            if unknown:
-                unknown_bytes = count.orphan_bytes.total()
-                write_hold(store, Hold(HoldReason.ADOPTED, unknown, unknown_bytes, count.objects))
-            adopt_store(catalog, store)
-    return count
-
-
-def _check_not_owned(catalog: Catalog, store: OwnedStore) -> None:
-    with catalog.write() as session:
-        installation_id = get_or_create_installation(session).id
-    if read_owner(store) == str(installation_id):
-        with contextlib.suppress(Misconfigured):  # an older catalog may be made the owner
-            check_not_behind(catalog, store)
-            raise Conflict("already_owner", "This catalog already owns the store.")
-
-
-def collect_storage(settings: Settings, *, confirm: bool) -> tuple[StoreCount, int, Hold | None]:
+def collect_storage(settings: Settings, *, confirm: bool) -> tuple[StoreCount, int, str | None]:
     """Count the store's orphans; with `confirm`, move them to the trash; return their number."""
     with _open_storage(settings, "storage") as (catalog, store):
         count, moved, hold = StoreCount(), 0, read_hold(store)

@@ -1,7 +1,7 @@
 """`placewise storage`: the catalog and the object store.
 
 `verify` checks every chunk against its hash and the catalog. Other subcommands create tables and
-the bucket, assign the store to a catalog, and manage orphaned objects and the trash.
+the bucket, and manage orphaned objects and the trash.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ REMEDIES = {
 }
 
 app = typer.Typer(
-    help="Verify, back up, restore and rebuild what is stored; manage the bucket, its owner, "
+    help="Verify, back up, restore and rebuild what is stored; manage the bucket, "
     "orphans and trash.",
     no_args_is_help=True,
 )
@@ -178,33 +178,6 @@ def create_bucket_command(as_json: JsonOption = False) -> None:
     )
 
 
-@app.command("adopt")
-def adopt(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
-    """Make this catalog the owner of the object store, also if the catalog is an older copy.
-
-    Use it if the catalog that owns the store is lost and you do not want to rebuild it. Stop every
-    service that uses the store first: services with the previous catalog refuse to start
-    afterwards. Objects that are not in this catalog are kept until you run `placewise storage
-    collect --confirm`.
-    """
-    from services.cli.operations.maintenance import adopt_storage
-
-    count = adopt_storage(read_settings(), confirm=confirm)
-    if as_json:
-        print_json({"adopted": confirm, **_as_dict(count)})
-        return
-    print_message(f"{count.objects} objects, {count.orphans.total()} of them not in this catalog")
-    _print_orphans(count)
-    if confirm:
-        print_message("This catalog is now the owner of the store.")
-    else:
-        print_message(
-            "Nothing was changed. Pass --confirm to make this catalog the owner. Services with "
-            "another catalog then refuse to start with this store. Objects that are not in the "
-            "catalog are kept but not searchable, until `placewise storage collect --confirm`."
-        )
-
-
 @app.command("collect")
 def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
     """Count orphaned objects by prefix; with --confirm, move them to the trash.
@@ -217,8 +190,7 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
     settings = read_settings()
     count, moved, hold = collect_storage(settings, confirm=confirm)
     if as_json:
-        hold_reason = None if hold is None else hold.reason
-        print_json({"moved": moved, "held": hold_reason, **_as_dict(count)})
+        print_json({"moved": moved, "held": hold is not None, **_as_dict(count)})
         return
     print_message(f"{count.objects} objects, {count.orphans.total()} of them orphaned")
     _print_orphans(count)
@@ -229,7 +201,7 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
         )
         return
     if hold is not None:
-        print_message(f"Garbage collection is on hold: {hold.describe()}")
+        print_message(f"Garbage collection is on hold: {hold}")
     print_message("Nothing was changed. Pass --confirm to move them to the trash.")
 
 

@@ -68,7 +68,7 @@ def read_photo_frames(folder: Path, timing: FrameTiming) -> list[SourceFrame]:
         InvalidRequest: `no_photos`; `no_times` if a photo of `Order.TIME` has no time.
     """
     photos = read_folder(folder, None, 0.0)
-    without_time = next((photo.path for photo in photos if photo.time is None), None)
+    without_time = next((folder / photo.id for photo in photos if photo.time is None), None)
     if timing.order == Order.TIME and without_time is not None:
         raise InvalidRequest(
             "no_times",
@@ -81,7 +81,7 @@ def read_photo_frames(folder: Path, timing: FrameTiming) -> list[SourceFrame]:
         _print_clock(timing.begin, None, "photos in the order of their names")
     frames = [
         SourceFrame(
-            photo.path,
+            folder / photo.id,
             photo.name,
             first + timedelta(seconds=number * timing.every_seconds)
             if by_name or photo.time is None

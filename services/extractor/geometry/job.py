@@ -60,7 +60,7 @@ from shared.errors import NotFound, Unprocessable
 from shared.geometry.cameras import Floats, Rays, hash_camera_key
 from shared.geometry.colmap_model import ColmapModel
 from shared.geometry.component import Component
-from shared.geometry.frames import GPS_SIGMA_M, Alignment, align, plane_at
+from shared.geometry.frames import GPS_SIGMA_M, Alignment, EastNorthUp, align, align_at, plane_at
 from shared.geometry.radius import PoseCalibration
 from shared.ids import new_id
 from shared.imaging.photo_header import read_photo_header
@@ -125,7 +125,8 @@ class ReconstructionJob:
         components = self._load_components(made, photos)
         if components is None:
             made, components = self._map(made, photos, matches, model)
-        self._finish(made, components, photos, result)
+        origin = EastNorthUp(*model.origin) if model and model.origin else None
+        self._finish(made, components, photos, result, origin)
 
     def _begin(self) -> Reconstruction:
         """Return the reconstruction of an earlier run of the job, or a new one."""
@@ -369,10 +370,11 @@ class ReconstructionJob:
         components: list[Component],
         photos: dict[UUID, MapPhoto],
         result: dict[str, Any],
+        origin: EastNorthUp | None,
     ) -> None:
         """Align and calibrate the components, and finish row and job in one transaction."""
         self._progress.update(MAPPED, "align")
-        alignments = [_align(component, photos) for component in components]
+        alignments = [_align(component, photos, origin) for component in components]
         calibrations = self._calibrate(made, components, alignments, photos)
         stored, proposals = [], list[dict[str, Any]]()
         for about, component, alignment, calibration in zip(
@@ -456,13 +458,21 @@ class ReconstructionJob:
         return leased
 
 
-def _align(component: Component, photos: Mapping[UUID, MapPhoto]) -> Alignment | str:
+def _align(
+    component: Component, photos: Mapping[UUID, MapPhoto], origin: EastNorthUp | None
+) -> Alignment | str:
     """Return the alignment of a component to its photos' coordinates, or why there is none.
 
     The fit takes the photos in the order in which they were taken; the alignment has them in the
     component's.
+
+    Args:
+        origin: of an imported model, whose axes are then east, north and up.
     """
     of_component = [photos[id_] for id_ in component.photo_ids]
+    if origin is not None:
+        places = _coordinates([photo.row for photo in of_component])
+        return align_at(origin, component.centres(), *places)
     order = np.argsort(_seconds(of_component), kind="stable")  # those without a time come last
     rows = [of_component[i].row for i in order]
     found = align(

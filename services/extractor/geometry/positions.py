@@ -25,8 +25,10 @@ from shared.geometry.frames import UNKNOWN_ALTITUDE_SIGMA_M
 if TYPE_CHECKING:
     from services.extractor.geometry.mapping import PhotoToMap
 
-MIN_PRIOR_SIGMA_M = 0.1
-"""Least standard deviation of coordinates"""
+MIN_PRIOR_SIGMA_M = 0.02
+"""Least standard deviation of coordinates: that of a survey"""
+LOSS_SCALE_PIXELS = 0.5
+"""Observations that are farther off count less and less: about the median error of XFeat"""
 
 
 def _positions(ids: Iterable[UUID], photos: Sequence[PhotoToMap]) -> Floats:
@@ -76,25 +78,45 @@ def misplaced_photos(
 def adjust_to_positions(pycolmap: Any, model: Any, photos: Sequence[PhotoToMap]) -> None:
     """Move a model to the positions of its photos, and adjust it with these as priors.
 
-    Their standard deviation is that of the model's distances from them.
+    Their standard deviation is that of the model's distances from them. Wrong observations hardly
+    count.
     """
     images = [model.image(number) for number in sorted(model.reg_image_ids())]
+    priors = _move_to_positions(pycolmap, model, images, photos)
+    if not priors:
+        return
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in images:
+        config.add_image(image.image_id)
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = LOSS_SCALE_PIXELS
+    of_priors = pycolmap.PosePriorBundleAdjustmentOptions()
+    of_priors.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    pycolmap.create_pose_prior_bundle_adjuster(options, of_priors, config, priors, model).solve()
+    model.update_point_3d_errors()
+
+
+def _move_to_positions(
+    pycolmap: Any, model: Any, images: Sequence[Any], photos: Sequence[PhotoToMap]
+) -> list[Any]:
+    """Move a model to the positions of its photos, and return these as priors; [] if unknown."""
     positions = _positions((UUID(image.name) for image in images), photos)
     rotations = [image.cam_from_world().rotation.matrix() for image in images]
     known = np.flatnonzero(np.isfinite(positions[:, :2]).all(axis=1))
     if len(known) < MIN_BLOCK:
-        return
+        return []
     centres = np.array([image.projection_center() for image in images])[known]
     found = fit_to_positions(centres, [rotations[row] for row in known.tolist()], positions[known])
     if found is None:
-        return
+        return []
     model.transform(
         pycolmap.Sim3d(found.scale, pycolmap.Rotation3d(found.rotation), found.translation)
     )
     distances = np.linalg.norm((found.apply(centres) - positions[known])[:, :2], axis=1)
     sigma = max(MIN_PRIOR_SIGMA_M, float(np.median(distances)) / RAYLEIGH_MEDIAN)
     priors, places = [], with_heights(positions)
-    for row in known:
+    for row in known.tolist():
         up = sigma if np.isfinite(positions[row, 2]) else UNKNOWN_ALTITUDE_SIGMA_M
         priors.append(
             pycolmap.PosePrior(
@@ -104,12 +126,4 @@ def adjust_to_positions(pycolmap: Any, model: Any, photos: Sequence[PhotoToMap])
                 coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
             )
         )
-    config = pycolmap.BundleAdjustmentConfig()
-    for image in images:
-        config.add_image(image.image_id)
-    options = pycolmap.PosePriorBundleAdjustmentOptions()
-    options.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    pycolmap.create_pose_prior_bundle_adjuster(
-        pycolmap.BundleAdjustmentOptions(print_summary=False), options, config, priors, model
-    ).solve()
-    model.update_point_3d_errors()
+    return priors

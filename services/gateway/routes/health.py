@@ -254,7 +254,7 @@ def _check_collection(gateway: GatewayContext) -> ComponentStatus:
     except PlacewiseError as error:
         return ComponentStatus(status="unhealthy", detail=error.detail)
     if hold is not None:
-        return ComponentStatus(status="degraded", detail=hold.describe())
+        return ComponentStatus(status="degraded", detail=hold)
     return ComponentStatus(status="healthy")
 
 

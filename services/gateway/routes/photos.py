@@ -7,7 +7,8 @@ import binascii
 import time
 from collections.abc import Iterator
 from datetime import datetime
-from typing import Annotated, Any, BinaryIO
+from functools import partial
+from typing import Annotated, Any, BinaryIO, Literal
 from urllib.parse import quote
 from uuid import UUID
 
@@ -23,6 +24,7 @@ from services.gateway.dependencies import (
     FileId,
     GatewayContext,
     GatewayDep,
+    MapParams,
     MapQuery,
     PageParams,
     invalid_cursor_error,
@@ -38,8 +40,14 @@ from shared.catalog.chunks import find_descriptor
 from shared.catalog.generations import active_generation
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import get_map, increment_map_version, lock_map
-from shared.catalog.photos import Photo, PhotoRole, get_photo, mark_photo_deleted
-from shared.errors import NotFound, invalid_field_error
+from shared.catalog.photos import (
+    Photo,
+    PhotoRole,
+    find_same_photo,
+    get_photo,
+    mark_photo_deleted,
+)
+from shared.errors import Conflict, NotFound, invalid_field_error
 from shared.http.request_model import RequestModel
 from shared.imaging.capture_place import MAX_ALTITUDE_M
 from shared.imaging.file_formats import needs_preview
@@ -134,26 +142,77 @@ def patch_photo(
         for name, value in columns.items():
             setattr(photo, name, value)
         photo.latitude, photo.longitude = coordinate_pair(photo.latitude, photo.longitude)
+        if columns.get("captured_at") is not None:  # UTC
+            utc = {"time_zone_is_known": True, "clock_offset_seconds": None}
+            photo.capture = {**(photo.capture or {}), **utc}
         photo.changed_version = increment_map_version(session, map_.id)
         session.flush()
         return _photo_detail_response(session, photo, query.map)
 
 
+class DeletePhotoParams(MapParams):
+    permanently: bool = Field(False, description="delete its bytes within seconds, for good")
+
+
 @router.delete("/uploads/{file_id}", operation_id="delete_photo", dependencies=[WRITE])
-def delete_photo(gateway: GatewayDep, file_id: FileId, query: MapQuery) -> DeletedPhotoResponse:
-    """Delete a photo. No search returns it any more; its bytes are deleted within seconds."""
+def delete_photo(
+    gateway: GatewayDep, file_id: FileId, query: Annotated[DeletePhotoParams, Query()]
+) -> DeletedPhotoResponse:
+    """Delete a photo. No search returns it any more.
+
+    It can be restored for REMOVED_PHOTO_DAYS, unless it is deleted `permanently`, which a photo in
+    the trash can be, too. Its bytes are deleted then.
+    """
+    days = 0.0 if query.permanently else gateway.settings.removed_photo_days
 
     def remove(session: Session) -> str:
         map_ = lock_map(session, get_map(session, query.map).id)
-        photo = get_photo(session, map_.id, file_id)
-        mark_photo_deleted(session, photo, increment_map_version(session, map_.id))
+        photo = get_photo(session, map_.id, file_id, or_removed=query.permanently)
+        mark_photo_deleted(session, photo, increment_map_version(session, map_.id), days)
         cancel_jobs(session, Job.photo_id == photo.id)
         return photo.filename
 
     filename = gateway.catalog.run(remove)
+    until = f"; it can be restored for {days:g} days" if days else ""
     return DeletedPhotoResponse(
-        success=True, message=f"The photo {filename} is deleted.", deleted_file_id=file_id
+        success=True, message=f"The photo {filename} is deleted{until}.", deleted_file_id=file_id
     )
+
+
+@router.post("/uploads/{file_id}/restore", operation_id="restore_photo", dependencies=[WRITE])
+def restore_photo(
+    gateway: GatewayDep, admission: AdmissionDep, file_id: FileId, query: MapQuery
+) -> PhotoDetailResponse:
+    """Restore a deleted photo from the trash; it is described again if it has to be.
+
+    A photo that is not deleted stays as it is. 409 (`photo_exists`) if its bytes were uploaded
+    again meanwhile.
+    """
+    admission.admit_job(query.map)
+
+    def restore(session: Session) -> tuple[PhotoDetailResponse, JobMessage | None]:
+        map_ = lock_map(session, get_map(session, query.map).id)
+        photo = get_photo(session, map_.id, file_id, or_removed=True)
+        if photo.deleted_at is None:
+            return _photo_detail_response(session, photo, query.map), None
+        same = find_same_photo(session, map_.id, photo.sha256, photo.picture_sha256)
+        if same is not None:
+            raise Conflict(
+                "photo_exists",
+                f"The photo {photo.filename} was added again meanwhile.",
+                file_id=str(same.id),
+            )
+        photo.deleted_at = photo.purge_at = None
+        photo.changed_version = increment_map_version(session, map_.id)
+        # Compaction may have dropped its descriptor; one that is still there stays as it is.
+        job = _queue_again(session, photo)
+        message = JobMessage.of(job, query.map, photo.filename)
+        return _photo_detail_response(session, photo, query.map), message
+
+    response, message = gateway.catalog.run(restore)
+    if message is not None:
+        gateway.wakeups.send(message)
+    return response
 
 
 @router.get(
@@ -194,9 +253,12 @@ def _original_response(request: Request, gateway: GatewayContext, photo: Photo) 
     dependencies=[READ],
 )
 def read_thumbnail(gateway: GatewayDep, file_id: FileId, query: MapQuery) -> Response:
-    """Get a small JPEG without metadata; it exists once the photo has been described."""
+    """Get a small JPEG without metadata; it exists once the photo has been described.
+
+    Photos in the trash have it, too.
+    """
     with gateway.catalog.read() as session:
-        photo = get_photo(session, get_map(session, query.map).id, file_id)
+        photo = get_photo(session, get_map(session, query.map).id, file_id, or_removed=True)
     try:
         data = gateway.store.get(thumbnail_key(photo.id))
     except NotFound:
@@ -272,6 +334,12 @@ def _queue_preview(
             f"The photo has no preview, because it has not been described. {reason}",
         )
     admission.admit_job(map_name)
+    return _queue_again(session, photo)
+
+
+def _queue_again(session: Session, photo: Photo) -> Job:
+    """Queue the photo's job again; a photo that was described has a descriptor, which stays."""
+    job = session.get(Job, photo.job_id, with_for_update=True) if photo.job_id else None
     if job is None:  # deleted, or lost with the catalog
         job = Job(
             map_id=photo.map_id,
@@ -303,6 +371,16 @@ class MetadataSearchParams(FilterParams, PageParams):
     failed: bool = Field(
         False, description="photos that can't be searched for, because their description failed"
     )
+    without_place: bool = Field(
+        False, description="photos that have neither coordinates nor a place label"
+    )
+    place_given: bool = Field(
+        False, description="photos whose place was given with `POST /places`, and not undone"
+    )
+    removed: bool = Field(False, description="photos in the trash, instead of those of the map")
+    sort: Literal["added", "taken"] = Field(
+        "added", description="newest first; `taken`: only photos whose time is known"
+    )
     limit: int = Field(100, ge=1, le=1000)
 
     def metadata_filter(self) -> MetadataFilter:
@@ -318,6 +396,10 @@ class MetadataSearchParams(FilterParams, PageParams):
             photos=self.photo_filter(),
             role=self.role,
             failed=self.failed,
+            without_place=self.without_place,
+            place_given=self.place_given,
+            removed=self.removed,
+            by_capture=self.sort == "taken",
         )
 
 
@@ -325,14 +407,14 @@ class MetadataSearchParams(FilterParams, PageParams):
 def search_photos_by_metadata(
     gateway: GatewayDep, query: Annotated[MetadataSearchParams, Query()]
 ) -> MetadataSearchResponse:
-    """Search photos by their metadata, newest first, with a cursor."""
+    """Search photos by their metadata, newest first, with a cursor (of the same `sort`)."""
     started = time.perf_counter()
     metadata_filter = query.metadata_filter()
     after = _decode_cursor(query.cursor) if query.cursor else None
     with gateway.catalog.read() as session:
         map_id = get_map(session, query.map).id
         matches, total = search_photos(session, map_id, metadata_filter, query.limit + 1, after)
-    page, next_cursor = query.split(matches, _encode_cursor)
+    page, next_cursor = query.split(matches, partial(_encode_cursor, metadata_filter))
     return MetadataSearchResponse(
         total_found=total,
         total_is_exact=total < MAX_COUNTED_MATCHES,
@@ -354,8 +436,10 @@ def _read_blocks(file: BinaryIO) -> Iterator[bytes]:
             yield block
 
 
-def _encode_cursor(last: Photo) -> str:
-    return base64.urlsafe_b64encode(f"{last.uploaded_at.isoformat()} {last.id}".encode()).decode()
+def _encode_cursor(metadata_filter: MetadataFilter, last: Photo) -> str:
+    time = last.captured_at if metadata_filter.by_capture else last.uploaded_at
+    assert time is not None
+    return base64.urlsafe_b64encode(f"{time.isoformat()} {last.id}".encode()).decode()
 
 
 def _decode_cursor(cursor: str) -> tuple[datetime, UUID]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
+from dataclasses import asdict
 from datetime import timedelta
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from fastapi import APIRouter, Body
 from pydantic import AwareDatetime, ConfigDict, Field, model_validator
@@ -24,9 +26,9 @@ from shared.geotagging.evidence import (
     SimilarPosition,
     TimeNeighbours,
     add_time_zones,
-    interpolate_position,
 )
-from shared.geotagging.fusion import propose_position
+from shared.geotagging.fusion import Proposal
+from shared.geotagging.locate import PositionFinder
 from shared.http.request_model import FailFastList, RequestModel
 from shared.imaging.capture_place import is_null_island
 from shared.imaging.photo_header import read_photo_header
@@ -52,11 +54,13 @@ Name = Annotated[str, Field(max_length=MAX_NAME)]
 ClockOffset = Annotated[timedelta, Field(ge=timedelta(days=-1), le=timedelta(days=1))]
 
 
-class _Finite(RequestModel):
+class FiniteModel(RequestModel):
+    """A body whose numbers are finite."""
+
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
-class SimilarBody(_Finite):
+class SimilarBody(FiniteModel):
     """A photo of the map that looks similar."""
 
     name: Name
@@ -65,7 +69,7 @@ class SimilarBody(_Finite):
     score: float = Field(ge=-10, le=10)
 
 
-class CircleBody(_Finite):
+class CircleBody(FiniteModel):
     """A level of the estimate."""
 
     latitude: Latitude
@@ -74,7 +78,7 @@ class CircleBody(_Finite):
     probability: Probability
 
 
-class PoseBody(_Finite):
+class PoseBody(FiniteModel):
     """The pose that a search found, if it has coordinates."""
 
     latitude: Latitude
@@ -83,7 +87,7 @@ class PoseBody(_Finite):
     heading: float = Field(ge=0, le=360)
 
 
-class SearchBody(_Finite):
+class SearchBody(FiniteModel):
     """What a similarity search answered for the photo."""
 
     similar: list[SimilarBody] = Field(max_length=MAX_SIMILAR, description="best first")
@@ -93,7 +97,7 @@ class SearchBody(_Finite):
     headline: str = Field("", max_length=MAX_NAME, description="of the estimate")
 
 
-class DatedPhotoBody(_Finite):
+class DatedPhotoBody(FiniteModel):
     """A photo of a folder, with or without coordinates."""
 
     name: Name
@@ -117,20 +121,15 @@ class DatedPhotoBody(_Finite):
         return coordinate_pair(self.latitude, self.longitude)
 
 
-class TrackPointBody(_Finite):
+class TrackPointBody(FiniteModel):
     time: AwareDatetime
     latitude: Latitude
     longitude: Longitude
 
 
-class PositionsBody(_Finite):
-    """The photos of a folder."""
+class ProposalOptions(FiniteModel):
+    """What is known beside the photos."""
 
-    photos: FailFastList[DatedPhotoBody] = Field(
-        max_length=10_000,
-        description=f"at most {MAX_UNLOCATED} of them without coordinates; the others show where "
-        "their camera was",
-    )
     track: FailFastList[TrackPointBody] = Field(
         default=[], max_length=10_000, description="points of a GPX track"
     )
@@ -138,6 +137,27 @@ class PositionsBody(_Finite):
     motion: Literal["walk", "bicycle", "car", "train"] = "walk"
     together: bool = Field(
         False, description="photos of all cameras are neighbours in time, not only of the same one"
+    )
+
+    def finder(self, photos: Sequence[DatedPhoto]) -> PositionFinder:
+        """Return what locates photos among others."""
+        points = [
+            KnownPosition(each.time, each.latitude, each.longitude)
+            for each in self.track
+            if not is_null_island(each.latitude, each.longitude)
+        ]
+        points.sort(key=lambda point: point.time)
+        neighbours = TimeNeighbours(photos, self.together)
+        return PositionFinder(neighbours, points, motion_model(self.motion), self.radius_m)
+
+
+class PositionsBody(ProposalOptions):
+    """The photos of a folder."""
+
+    photos: FailFastList[DatedPhotoBody] = Field(
+        max_length=10_000,
+        description=f"at most {MAX_UNLOCATED} of them without coordinates; the others show where "
+        "their camera was",
     )
 
     @model_validator(mode="after")
@@ -193,43 +213,26 @@ def propose_positions(
         for each in body.photos
     ]
     photos = add_time_zones(photos)
-    neighbours = TimeNeighbours(photos, body.together)
-    track = sorted(
-        (
-            KnownPosition(each.time, each.latitude, each.longitude)
-            for each in body.track
-            if not is_null_island(each.latitude, each.longitude)
-        ),
-        key=lambda point: point.time,
-    )
-    speed = motion_model(body.motion).max_speed_mps
+    finder = body.finder(photos)
     proposals = []
     for photo, sent in zip(photos, body.photos, strict=True):
         if photo.latitude is not None:
             continue
-        on_track = None
-        if photo.time is not None and photo.time_zone_is_known:
-            on_track = interpolate_position(track, photo.time, speed)
         picture = _picture_evidence(sent.search, photo_count)
-        proposal = propose_position(
-            picture,
-            neighbours.position_of(photo, speed),
-            on_track,
-            body.radius_m,
-        )
+        proposal, reason = finder.propose(photo, picture)
         proposals.append(
-            ProposalResponse(
-                name=photo.name,
-                latitude=proposal.latitude if proposal else None,
-                longitude=proposal.longitude if proposal else None,
-                radius_m=body.radius_m,
-                probability=proposal.probability if proposal else 0.0,
-                radius_68_m=proposal.radius_68_m if proposal else None,
-                heading=proposal.heading if proposal else None,
-                reason=proposal.reason if proposal else neighbours.why_unknown(photo, picture),
-            )
+            ProposalResponse(**proposal_fields(photo.name, proposal, reason, body.radius_m))
         )
     return ProposalsResponse(proposals=proposals)
+
+
+def proposal_fields(
+    name: str, proposal: Proposal | None, reason: str, radius_m: float
+) -> dict[str, Any]:
+    """Return the fields of a `ProposalResponse`."""
+    if proposal is None:
+        return {"name": name, "radius_m": radius_m, "probability": 0.0, "reason": reason}
+    return {"name": name, **asdict(proposal)}
 
 
 def _picture_evidence(search: SearchBody | None, photo_count: int) -> PictureEvidence | None:

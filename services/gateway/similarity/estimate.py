@@ -20,6 +20,11 @@ NOT_MEASURED = (
     "How certain this place is, and whether it is in the map, is not measured yet: the map has not "
     "been evaluated with 20 or more photos that have coordinates or a label."
 )
+NEW_TO_THE_MAP = (
+    "Photos like these are new to this map: recent queries are less similar to it than those that "
+    "its probabilities were measured on, as in another season or with another camera. Add 40 of "
+    "them with their places as labelled queries."
+)
 
 
 def locate_hits(hits: Sequence[SearchHit], photos: Mapping[UUID, Photo]) -> list[RankedPhoto]:
@@ -30,7 +35,12 @@ def locate_hits(hits: Sequence[SearchHit], photos: Mapping[UUID, Photo]) -> list
 
 
 def estimate_place(
-    estimate: PlaceEstimate | None, certainty: float, elsewhere: float, no_place_reason: str
+    estimate: PlaceEstimate | None,
+    certainty: float,
+    elsewhere: float,
+    no_place_reason: str,
+    *,
+    is_new: bool = False,
 ) -> EstimateResponse:
     """Return the place that a ranking points to, and how certain it is.
 
@@ -42,6 +52,7 @@ def estimate_place(
         certainty: Share of the answers that must be right.
         elsewhere: Prior probability that a query is from elsewhere.
         no_place_reason: The reason if there is no estimate.
+        is_new: Whether the recent queries are new to the map (`PlaceModel.is_new`).
     """
     if estimate is None:
         return EstimateResponse(headline=no_place_reason, reason=no_place_reason)
@@ -80,7 +91,11 @@ def estimate_place(
         radius_95_m=estimate.radius_95_m,
         calibration_source=estimate.model.calibration_source,
     )
-    return _in_words(response)
+    worded = _in_words(response)
+    if not is_new:
+        return worded
+    reason = f"{worded.reason} {NEW_TO_THE_MAP}"
+    return worded.model_copy(update={"new_to_map": True, "reason": reason})
 
 
 def place_at_pose(estimate: EstimateResponse, pose: CameraPoseResponse) -> EstimateResponse:

@@ -31,7 +31,14 @@ from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import find_descriptor
 from shared.catalog.database.errors import to_unavailable
 from shared.catalog.generations import Generation, RowType, active_generation
-from shared.catalog.maps import Map, Matching, Search, get_map, map_not_found_error
+from shared.catalog.maps import (
+    Map,
+    Matching,
+    Search,
+    get_map,
+    map_not_found_error,
+    recent_best_scores,
+)
 from shared.catalog.photos import Photo, get_live_photos, get_photo
 from shared.catalog.vocabularies import vocabulary_standing
 from shared.errors import Conflict, Gone, StorageFull
@@ -188,11 +195,8 @@ def run_similarity_search(
     rankings = _rank_photos(search, search_params)
     matches = _match_best_photos(search, rankings, search_params)
     estimate, probabilities = _estimate(search, rankings, matches, search_params)
-    # Along coordinates, queries of another season look as if they were not in the map.
-    is_labelled = bool(estimate.levels) and estimate.levels[0].radius_m is None
-    is_missing = is_labelled and estimate.in_map is False
     candidates = _pose_candidates(search, rankings, search_params)
-    pose = find_pose(gateway, query, candidates, search_params, is_missing=is_missing)
+    pose = find_pose(gateway, query, candidates, search_params, estimate)
     similar = rankings.similar
     if isinstance(pose, CameraPoseResponse):
         estimate = place_at_pose(estimate, pose)
@@ -372,7 +376,8 @@ def _estimate(
     query, settings = search.query, search.gateway.settings
     found, whole_map = rankings.found, rankings.whole_map
     model, scheme = _place_model(search)
-    certainty = search_params.certainty or settings.certainty
+    certainty, guarantee = search_params.certainty or settings.certainty, search_params.guarantee
+    model.threshold(certainty, guarantee)  # refuses a guarantee also where nothing is found
     elsewhere = search_params.elsewhere or query.map.elsewhere or ELSEWHERE_SHARE
     neighbours = search.rank_neighbours(whole_map.hits[0].photo_id) if whole_map.hits else ()
     places = model.estimate(
@@ -383,16 +388,27 @@ def _estimate(
         settings.estimate_radius_m,
         matches.add_to(rankings.located.ranking),
         elsewhere,
+        guarantee,
     )
     similar = locate_hits(rankings.similar.hits[: search_params.top_k], rankings.similar.photos)
     if not any(ranked.location.is_known for ranked in similar):
         places = None  # the photos that it would be named after do not look like the query
     reason = _no_place_reason(found.hits, search_params.photos)
-    estimate = estimate_place(places, certainty, elsewhere, reason)
+    is_new = places is not None and _is_new(search, model)
+    estimate = estimate_place(places, certainty, elsewhere, reason, is_new=is_new)
     if places is None or not model.is_fitted:
         return estimate, {}
     best = (hit.photo_id for hit in rankings.located.hits)
     return estimate, dict(zip(best, places.match_probabilities, strict=True))
+
+
+def _is_new(search: _MapSearch, model: PlaceModel) -> bool:
+    """Return whether the recent queries of the map are new to it."""
+    if not model.best_scores:  # the map was not evaluated since scores are kept
+        return False
+    with search.gateway.catalog.read() as session:
+        recent = recent_best_scores(session, search.query.map.id, search.query.generation.id)
+    return model.is_new(recent)
 
 
 def _place_model(search: _MapSearch) -> tuple[PlaceModel, LevelScheme]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,7 @@ from shared.catalog.photos import Photo
 from shared.catalog.reconstructions import ReconstructedComponent, current_reconstruction
 from shared.errors import PlacewiseError
 from shared.geometry.cameras import CameraSource
-from shared.responses.similarity import CameraPoseResponse, PoseCameraResponse
+from shared.responses.similarity import CameraPoseResponse, EstimateResponse, PoseCameraResponse
 from shared.search_api.protocol import (
     ComponentPose,
     GeographicPose,
@@ -31,6 +32,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+POINTS_TO_DOUBLE_ODDS = 15  # that a pose is right: poses of foreign photos have fewer than 30
+MAX_NOT_IN_MAP = 0.999
+
 NOT_CALIBRATED = (
     "How far off poses are could not be measured in this component: too few of its photos find "
     "their pose without themselves. Add photos, and run `placewise reconstruct`."
@@ -42,19 +46,21 @@ def find_pose(
     query: SimilarityQuery,
     hits: Sequence[SearchHit],
     search_params: SearchParams,
-    *,
-    is_missing: bool = False,
+    estimate: EstimateResponse | None = None,
 ) -> CameraPoseResponse | str | None:
     """Return the pose of a query, or why it has none, as a sentence; None if it was not requested.
 
     Args:
         hits: The most similar photos, best first.
-        is_missing: Whether the estimate says that the place is not in the map. Floors that are
-            built alike agree in their points, so only the estimate tells that the map lacks one.
+        estimate: Its "not in this map" is the prior of the pose. Floors that are built alike agree
+            in their points, so in a map of labels only the estimate tells that it lacks one. Along
+            coordinates, queries of another season look as if they were not in the map, and enough
+            points outweigh that.
     """
     if not search_params.pose:
         return None
-    if is_missing:
+    against = estimate if estimate and estimate.in_map is False else None
+    if against and against.levels[0].radius_m is None:
         return (
             "The place is probably not in this map, and places that are built alike agree in their "
             "points. Add photos of it, and run `placewise reconstruct`."
@@ -102,7 +108,19 @@ def find_pose(
         return error.detail
     if found.pose is None:
         return found.reason or "The query has no pose."
+    if against and found.pose.inliers < (needed := _points_against(against)):
+        return (
+            f"{found.pose.inliers} points agree with a position, but the place is probably not "
+            f"in this map: {needed} would be needed. Add photos of it, and run `placewise "
+            "reconstruct`."
+        )
     return _to_response(found.pose, components[found.pose.component])
+
+
+def _points_against(estimate: EstimateResponse) -> int:
+    """Return how many points outweigh "not in this map"."""
+    outside = min(max(estimate.not_in_map_probability or 0.0, 0.5), MAX_NOT_IN_MAP)
+    return math.ceil(POINTS_TO_DOUBLE_ODDS * math.log2(outside / (1 - outside)))
 
 
 def _to_message(component: ReconstructedComponent) -> PoseComponent:

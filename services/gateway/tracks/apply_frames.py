@@ -167,6 +167,8 @@ def _pose_fix(
         latitude=pose.latitude,
         longitude=pose.longitude,
         accuracy_m=min(pose.radius_68_m, MAX_ACCURACY_M),
+        radius_95_m=pose.radius_95_m,
+        heading=pose.heading,
     )
 
 
@@ -212,7 +214,7 @@ def _advance(
         changed: dict[UUID, dict[str, Any]] = {}
         for frame_id, each in [(frame.id, evidence), *((f.id, _evidence_of(f)) for f in later)]:
             belief = track_filter.advance(belief, each)
-            state = track_state_response(track_filter.state(belief))
+            state = track_state_response(track_filter.state(belief), each.fix)
             changed[frame_id] = {
                 "state": state.model_dump(mode="json"),
                 "belief": belief.to_bytes(),
@@ -262,8 +264,8 @@ def smooth_states(
         evidence = [_evidence_of(frame) for frame in applied]
         states = track_filter.smoothed_states(evidence, _start_belief(graph, track, evidence[0]))
         return {
-            frame.id: track_state_response(state)
-            for frame, state in zip(applied, states, strict=True)
+            frame.id: track_state_response(state, each.fix)
+            for frame, state, each in zip(applied, states, evidence, strict=True)
         }
 
 

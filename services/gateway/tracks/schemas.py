@@ -10,6 +10,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from services.gateway.dependencies import NO_NUL_PATTERN
 from shared.errors import invalid_field_error
+from shared.geodesy import distance_m
 from shared.http.request_model import RequestModel
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS, parse_time
 from shared.responses.similarity import EstimateLevelResponse
@@ -154,8 +155,9 @@ def parse_frame_form(fields: dict[str, str]) -> FrameForm:
         raise invalid_field_error(name, first["msg"].removeprefix("Value error, ")) from None
 
 
-def track_state_response(state: TrackState) -> TrackStateResponse:
-    return TrackStateResponse(
+def track_state_response(state: TrackState, fix: PositionFix | None) -> TrackStateResponse:
+    """Return the state of a frame: where its pose is, if that is within the finest level."""
+    response = TrackStateResponse(
         status=state.status,
         image_id=None if state.photo is None else UUID(state.photo),
         latitude=state.latitude,
@@ -167,4 +169,21 @@ def track_state_response(state: TrackState) -> TrackStateResponse:
         radius_68_m=state.radius_68_m,
         radius_95_m=state.radius_95_m,
         not_in_map_probability=state.outside,
+    )
+    finest_m = response.levels[0].radius_m if response.levels else None
+    if fix is None or fix.radius_95_m is None or finest_m is None:
+        return response
+    assert response.latitude is not None
+    assert response.longitude is not None
+    here = response.latitude, response.longitude
+    if distance_m(*here, fix.latitude, fix.longitude) > finest_m:
+        return response
+    return response.model_copy(
+        update={
+            "latitude": fix.latitude,
+            "longitude": fix.longitude,
+            "heading": fix.heading,
+            "radius_68_m": fix.accuracy_m,
+            "radius_95_m": fix.radius_95_m,
+        }
     )

@@ -22,7 +22,7 @@ from shared.catalog.database.base import count_rows, db_now
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, lock_generation
 from shared.catalog.maps import Map, increment_map_version, lock_map
-from shared.catalog.photos import Photo
+from shared.catalog.photos import Photo, is_kept
 from shared.errors import NotFound, Unavailable
 from shared.ids import new_id
 from shared.storage import ObjectStore
@@ -229,7 +229,7 @@ def _find_slots_to_merge(catalog: Catalog, compact_chunks: int) -> list[tuple[UU
 
 
 def _count_live_rows(session: Session, generation_id: UUID, slot: int) -> int:
-    """Count the rows of the slot that belong to live photos."""
+    """Count the rows of the slot that `list_live_rows` lists."""
     live = (
         select(Chunk.id)
         .join(Descriptor, Descriptor.chunk_id == Chunk.id)
@@ -238,7 +238,7 @@ def _count_live_rows(session: Session, generation_id: UUID, slot: int) -> int:
             Chunk.generation_id == generation_id,
             Chunk.slot == slot,
             Chunk.superseded_at.is_(None),
-            Photo.deleted_at.is_(None),
+            is_kept(),
         )
     )
     return count_rows(session, live)

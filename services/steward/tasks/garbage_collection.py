@@ -213,9 +213,9 @@ def delete_reconstructions(
 
 
 def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
-    """Delete the objects of deleted photos at once, and their rows after `grace_seconds`.
+    """Delete the objects of deleted photos at `purge_at`, and their rows after `grace_seconds`.
 
-    The objects (original, thumbnail, preview) go as soon as the journal has recorded the deletion.
+    The objects (original, thumbnail, preview) stay until the journal has recorded the deletion.
     After the grace period every search worker has seen the deletion and compaction has dropped the
     descriptors and local features.
     """
@@ -224,7 +224,10 @@ def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: 
         photos = session.scalars(
             select(Photo)
             .where(
-                Photo.deleted_at.is_not(None), Photo.object_key != "", deletion_is_journaled(Photo)
+                Photo.deleted_at.is_not(None),
+                Photo.purge_at <= db_now(),
+                Photo.object_key != "",
+                deletion_is_journaled(Photo),
             )
             .limit(ROWS_PER_TRANSACTION)
         ).all()

@@ -28,7 +28,7 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.installation import check_not_behind
 from shared.catalog.jobs import UNFINISHED_STATES, UPLOAD_JOBS, Job, JobKind, JobState
 from shared.catalog.models import Model
-from shared.catalog.photos import Photo, PresignedUpload
+from shared.catalog.photos import Photo, PresignedUpload, is_kept
 from shared.catalog.reconstructions import Reconstruction
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.errors import Conflict
@@ -52,14 +52,7 @@ from shared.storage.keys import (
     query_object_keys,
 )
 from shared.storage.protocol import ObjectInfo
-from shared.storage.trash import (
-    Hold,
-    HoldReason,
-    end_hold,
-    move_to_trash,
-    read_hold,
-    write_hold,
-)
+from shared.storage.trash import end_hold, move_to_trash, read_hold, write_hold
 
 log = logging.getLogger(__name__)
 
@@ -67,14 +60,6 @@ OBJECTS_PER_LOOKUP = 500  # keys looked up in one query
 MAX_ORPHANS_PER_RUN = 100_000  # they are held in memory until all are counted
 MAX_ORPHAN_SHARE = 0.1  # of all objects; a larger one is held until it is confirmed
 HOLD_MIN_ORPHANS = 100  # so few are never held: in a small store they are a large share
-
-
-class CollectionHeld(Conflict):
-    """Orphan collection is held until an operator confirms it."""
-
-    def __init__(self, hold: Hold) -> None:
-        super().__init__("collection_held", hold.describe())
-        self.hold = hold
 
 
 @dataclass(slots=True)
@@ -86,6 +71,20 @@ class StoreCount:
     """Prefix -> number of orphans."""
     orphan_bytes: Counter[str] = field(default_factory=Counter)
     """Prefix -> bytes of its orphans."""
+
+
+class CollectionHeld(Conflict):
+    """Orphan collection is held until an operator confirms it."""
+
+    def __init__(self, count: StoreCount) -> None:
+        super().__init__(
+            "collection_held",
+            f"No row of the catalog references {count.orphans.total()} of {count.objects} objects "
+            f"({count.orphan_bytes.total() / 1e6:.1f} MB), more than a tenth: nothing was "
+            "collected. If this is the wrong catalog, restore the right one, or run `placewise "
+            "storage verify --repair`. If the objects are garbage, `placewise storage collect` "
+            "lists them, and with --confirm it moves them to the trash.",
+        )
 
 
 def collect_orphans(
@@ -105,9 +104,8 @@ def collect_orphans(
         The number of objects moved.
 
     Raises:
-        CollectionHeld: Nothing was moved, because the catalog adopted a store whose objects it does
-            not know, or because the orphans exceed MAX_ORPHAN_SHARE of all objects. A note in the
-            store records the hold.
+        CollectionHeld: Nothing was moved, because the orphans exceed MAX_ORPHAN_SHARE of all
+            objects. A note in the store records the hold.
         Misconfigured: As `check_not_behind`; nothing was moved.
     """
     check_not_behind(catalog, store)
@@ -115,46 +113,23 @@ def collect_orphans(
     for info in find_orphans(catalog, store, age_seconds, count):
         if len(found) < MAX_ORPHANS_PER_RUN:
             found.append(info)
-    orphans, previous_hold = count.orphans.total(), read_hold(store)
-    if orphans and not confirmed:
-        reason = None
-        if previous_hold is not None and previous_hold.reason == HoldReason.ADOPTED:
-            reason = HoldReason.ADOPTED
-        elif orphans > max(HOLD_MIN_ORPHANS, MAX_ORPHAN_SHARE * count.objects):
-            reason = HoldReason.SHARE
-        if reason is not None:
-            hold = Hold(reason, orphans, count.orphan_bytes.total(), count.objects)
-            if hold != previous_hold:
-                write_hold(store, hold)
-            raise CollectionHeld(hold)
+    previous_hold = read_hold(store)
+    limit = max(HOLD_MIN_ORPHANS, MAX_ORPHAN_SHARE * count.objects)
+    if count.orphans.total() > limit and not confirmed:
+        held = CollectionHeld(count)
+        if held.detail != previous_hold:
+            write_hold(store, held.detail)
+        raise held
     moved, today = 0, _now(catalog).date()
     for prefix, same_prefix in groupby(found, lambda info: info.key.partition("/")[0] + "/"):
         for batch in _batches(same_prefix):
             for info in _select_orphans(catalog, prefix, batch):  # still
                 moved += move_to_trash(store, info.key, today)
-    if previous_hold is not None and (confirmed or previous_hold.reason != HoldReason.ADOPTED):
+    if previous_hold is not None:
         end_hold(store)
     if moved:
         log.info("moved %d orphaned objects to the trash", moved)
     return moved
-
-
-def count_store(catalog: Catalog | None, store: ObjectStore) -> StoreCount:
-    """Count all objects and the orphans of any age; without a catalog, every object is an orphan.
-
-    Objects under `originals/` whose keys Placewise did not make are never orphans.
-    """
-    count = StoreCount()
-    if catalog is not None:
-        for _ in find_orphans(catalog, store, 0.0, count):
-            pass
-        return count
-    for prefix in REFERENCED_BY_PREFIX:
-        for info in _count_objects(store.list(prefix), count):
-            if prefix != ORIGINALS or is_original_key(info.key):
-                count.orphans[prefix] += 1
-                count.orphan_bytes[prefix] += info.size_bytes
-    return count
 
 
 def find_orphans(
@@ -256,10 +231,8 @@ def _referenced_incoming(session: Session, keys: list[str]) -> Iterable[str]:
 
 def _referenced_derived_images(session: Session, keys: list[str]) -> Iterable[str]:
     photo_ids = _parse_uuids(key.rpartition("/")[2].removesuffix(".jpg") for key in keys)
-    live = session.scalars(
-        select(Photo.id).where(Photo.id.in_(photo_ids), Photo.deleted_at.is_(None))
-    )
-    return [key for photo_id in live for key in derived_image_keys(photo_id)]
+    kept = session.scalars(select(Photo.id).where(Photo.id.in_(photo_ids), is_kept()))
+    return [key for photo_id in kept for key in derived_image_keys(photo_id)]
 
 
 def _referenced_chunks(session: Session, keys: list[str]) -> Iterable[str]:

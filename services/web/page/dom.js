@@ -63,13 +63,18 @@ export function bar(label, done, total) {
   return h("progress", { "aria-label": label, max: known ? total : null, value: known ? done : null });
 }
 
-/** A short message at the lower edge, in the place of an equal one; read out by screen readers. */
-export function note(text, kind = "") {
+/** A short message at the lower edge, in the place of an equal one; read out by screen readers. `undo` is what its button does. */
+export function note(text, kind = "", undo = null) {
   const notes = document.getElementById("notes");
   for (const earlier of [...notes.children]) if (earlier.firstChild.data === text) earlier.remove();
-  const line = h("p", { class: `note ${kind}` }, text, h("button", { type: "button", class: "bare", "aria-label": "Close this message", onclick: () => line.remove() }, "×"));
+  const line = h("p", { class: `note ${kind}` }, text,
+    undo && button("Undo", async () => {
+      await undo();
+      line.remove();
+    }, "link"),
+    h("button", { type: "button", class: "bare", "aria-label": "Close this message", onclick: () => line.remove() }, "×"));
   notes.append(line);
-  setTimeout(() => line.remove(), kind === "bad" ? 12000 : 5000);
+  setTimeout(() => line.remove(), undo ? 30_000 : kind === "bad" ? 12_000 : 5000);
 }
 
 /** Announce to screen readers what has changed on the screen. */

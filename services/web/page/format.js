@@ -13,6 +13,12 @@ export const strength = (probability) => (probability === null ? null : STRENGTH
 /** A photo's name, with its folders if it was uploaded with them. */
 export const nameOf = (photo) => photo.relative_path ?? photo.original_filename;
 
+/** The folders of a photo that was uploaded with them, else "". */
+export const folderOf = (photo) => photo.relative_path?.split("/").slice(0, -1).join("/") ?? "";
+
+/** The day of a photo, whose clock may have had another zone: as it is stored. */
+export const day = (text) => new Date(text).toLocaleDateString("en-GB", { timeZone: "UTC", day: "numeric", month: "long", year: "numeric" });
+
 export function bytes(number) {
   const units = ["B", "kB", "MB", "GB", "TB"];
   const power = number < 1000 ? 0 : Math.min(units.length - 1, Math.floor(Math.log10(number) / 3));

@@ -1,9 +1,10 @@
-// The map: Leaflet with a graticule, or with streets once the visitor has agreed to load them.
+// The map: Leaflet with a graticule, or with streets once the visitor, or who runs the server, has agreed to load them.
 
 import { confirmed, h, note, noteError } from "./dom.js";
 import { serverSettings } from "./settings.js";
 
-const STREETS = "placewise-streets"; // the origin of the tiles that this device may load
+const STREETS = "placewise-streets"; // the origin of the tiles that this device may load, or HIDDEN
+const HIDDEN = "hidden";
 
 const MOST_ZOOM = 21;
 const LINES = 9; // about so many across the map
@@ -119,10 +120,15 @@ function addGround(map, element, settings) {
   const drawLines = () => drawGraticule(map, lines);
   map.on("moveend resize", drawLines);
   if (map.getSize().x) drawLines();
-  if (!settings.map_tiles) return;
+  if (!settings.map_tiles) {
+    addControl(map, h("p", { class: "map-note" }, "No streets: this server names no street map."));
+    return;
+  }
   const { origin } = new URL(settings.map_tiles, location.href);
   const tiles = L.tileLayer(settings.map_tiles, { attribution: escaped(settings.map_attribution), className: "streets", maxZoom: MOST_ZOOM, maxNativeZoom: 19 });
-  const allowed = () => origin === location.origin || localStorage.getItem(STREETS) === origin;
+  // An operator who has named a tile server has decided for the visitors, who can hide the streets.
+  const isChosen = origin === location.origin || settings.map_tiles_are_chosen;
+  const allowed = () => localStorage.getItem(STREETS) === origin || (isChosen && localStorage.getItem(STREETS) !== HIDDEN);
   const toggle = h("button", { type: "button", class: "streets-button", "aria-pressed": "false" }, "Streets");
   const show = (shown) => {
     toggle.setAttribute("aria-pressed", String(shown));
@@ -147,9 +153,9 @@ function addGround(map, element, settings) {
   toggle.addEventListener("click", async () => {
     try {
       if (map.hasLayer(tiles)) {
-        localStorage.removeItem(STREETS);
+        localStorage.setItem(STREETS, HIDDEN);
         show(false);
-      } else if (allowed() || await mayLoad(origin)) {
+      } else if (isChosen || allowed() || await mayLoad(origin)) {
         localStorage.setItem(STREETS, origin);
         show(true);
       }
@@ -157,14 +163,18 @@ function addGround(map, element, settings) {
       noteError(error);
     }
   });
-  const control = L.control({ position: "topright" });
-  control.onAdd = () => {
-    L.DomEvent.disableClickPropagation(toggle);
-    return toggle;
-  };
-  control.addTo(map);
+  addControl(map, toggle);
   element.classList.add("has-streets");
   if (allowed()) show(true);
+}
+
+function addControl(map, element) {
+  const control = L.control({ position: "topright" });
+  control.onAdd = () => {
+    L.DomEvent.disableClickPropagation(element);
+    return element;
+  };
+  control.addTo(map);
 }
 
 /** Ask before the browser loads anything from another server. */

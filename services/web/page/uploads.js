@@ -18,6 +18,12 @@ const SIDECAR = /\.xmp$/i;
 const TABLE = /(^|\/)(photos\.csv|manifest\.jsonl)$/;
 const PHOTO = /\.(jpe?g|jpe|jfif|png|webp|bmp|tiff?|heic|heif)$/i;
 
+/** How many were added, and how many the map had before. */
+export function addedInWords({ done, already }) {
+  const added = `${plural(done - already, "photo")} added`;
+  return already ? `${added}, ${count(already)} already there` : added;
+}
+
 /** One row of the list: a photo, or a batch of photos. */
 class Entry {
   constructor(queue, name, total) {
@@ -36,6 +42,8 @@ class Entry {
     this.sent = 0;
     this.done = 0;
     this.failed = 0;
+    /** How many of the done ones the map had before. */
+    this.already = 0;
     this.job = null;
     this.errors = [];
     this.hold = null;
@@ -91,8 +99,8 @@ class Entry {
       case "waiting": return "Waiting for its turn";
       case "sending": return this.sent < 1 ? `Being sent, ${Math.floor(100 * this.sent)} %` : "Being stored";
       case "working": return this.total > 1 ? `${count(this.done)} of ${count(this.total)} searchable` : `Stored, ${this.job ? stateInWords(this.job) : "waiting"}`;
-      case "failed": return this.total > 1 ? `${count(this.done)} added, ${count(this.failed)} failed` : "Failed";
-      default: return this.total > 1 ? `${plural(this.done, "photo")} added` : this.already ? "Searchable; the map had it already" : "Searchable";
+      case "failed": return this.total > 1 ? `${addedInWords(this)}, ${count(this.failed)} failed` : "Failed";
+      default: return this.total > 1 ? addedInWords(this) : this.already ? "Searchable; the map had it already" : "Searchable";
     }
   }
 }
@@ -111,7 +119,7 @@ class PhotoEntry extends Entry {
     for (const [name, value] of Object.entries(this.fields)) form.append(name, Array.isArray(value) ? value.join(",") : value);
     form.append("file", this.picture, this.picture.name);
     const stored = await this.sendForm("/upload", form);
-    this.already = stored.already_there;
+    this.already = Number(stored.already_there);
     if (stored.job_id && stored.status !== "succeeded") {
       this.set({ phase: "working" });
       const job = await this.watch(stored.job_id);
@@ -141,6 +149,7 @@ class BatchEntry extends Entry {
     this.set({ phase: "working" });
     const job = await this.watch(this.batch);
     const { done, failed, total } = job.progress;
+    this.already = job.result?.already_there ?? 0;
     const errors = failed ? await this.#failedItems() : [];
     if (job.state !== "succeeded" && job.error && !errors.length) errors.push({ ...job.error, name: "" });
     const canRetry = job.state === "cancelled" || failed > errors.length || errors.some(maySucceed);
@@ -252,7 +261,7 @@ export class UploadQueue {
 
   figures() {
     const sum = (name) => this.entries.reduce((all, entry) => all + entry[name], 0);
-    return { total: sum("total"), done: sum("done"), failed: sum("failed"), sending: this.entries.some((entry) => ["waiting", "sending"].includes(entry.phase)) };
+    return { total: sum("total"), done: sum("done"), failed: sum("failed"), already: sum("already"), sending: this.entries.some((entry) => ["waiting", "sending"].includes(entry.phase)) };
   }
 
   retryable() {

@@ -81,14 +81,16 @@ T = TypeVar("T")
 
 
 class CommitSignal:
-    """Counts the commits of this process that changed rows, and wakes threads that wait for one."""
+    """Counts the commits of a server that changed rows, and wakes threads that wait for one."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self.count = 0
+        self.announce: Callable[[], object] = lambda: None
+        """Called after each commit of this process, to tell the other one of the server."""
 
-    def notify(self) -> None:
-        """Count a commit."""
+    def count_one(self) -> None:
+        """Count a commit of this process or the other one."""
         with self._changed:
             self.count += 1
             self._changed.notify_all()
@@ -129,7 +131,7 @@ class Catalog:
             self.engine = make_postgres_engine(self.url, pool)
         self._sessions = sessionmaker(expire_on_commit=False)
         self._bind(limits)
-        # SQLite has one writer: a lock is fair and does not poll, unlike SQLite's busy handler.
+        # SQLite has one writer: among threads a lock does not poll, unlike SQLite's busy handler.
         self._sqlite_writer = threading.Lock()
         self.commits = CommitSignal()
 
@@ -170,7 +172,8 @@ class Catalog:
             changed = _changed_rows(session) != before
             session.commit()
         if changed and not is_heartbeat:
-            self.commits.notify()
+            self.commits.count_one()
+            self.commits.announce()
 
     def run(self, unit: Callable[[Session], T]) -> T:
         """Run `unit` in a write transaction, commit, and return its result.
@@ -220,8 +223,9 @@ STOP_CHECK_SECONDS = 0.5
 class ChangePoll:
     """Paces a loop that looks for work in the catalog.
 
-    SQLite is written by one process only: without a commit since the last look, the loop pauses up
-    to IDLE_SECONDS. PostgreSQL, which others write to, is polled at the loop's interval.
+    The processes that write to SQLite announce their commits: without one since the last look, the
+    loop pauses up to IDLE_SECONDS. PostgreSQL, which others write to, is polled at the loop's
+    interval.
     """
 
     def __init__(self, catalog: Catalog) -> None:

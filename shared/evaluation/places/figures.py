@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from shared.evaluation.bootstrap import bootstrap_intervals
+from shared.evaluation.bootstrap import share_intervals
 from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.fit import MapScores, PlaceSample, fit_place_model
 from shared.evaluation.places.levels import LevelScheme
@@ -125,7 +125,7 @@ def _mean(values: Sequence[float]) -> float | None:
 def share_with_interval(values: Sequence[bool]) -> dict[str, Any]:
     """Return the mean with its bootstrap interval; each query is a cluster of its own."""
     column = np.array(values, dtype=np.float64)[:, None]
-    intervals = bootstrap_intervals(column, np.arange(len(column)))
+    intervals = share_intervals(column, np.arange(len(column)))
     return {
         "mean": _mean(values),
         "interval": intervals[0].as_json() if intervals else None,

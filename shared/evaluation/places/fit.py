@@ -4,10 +4,12 @@ Each regression is fitted by maximum a posteriori. The Gaussian prior is centred
 coefficients: a small map stays near them, a large one follows its own photos.
 
 The samples are the map's own photos, each searched without itself, and *impostors*: the same photos
-searched as if the map had no photo of a place that shows them. Impostors have the total weight
-`UNMAPPED_SHARE`: that share of queries of places without a photo is assumed. Labelled queries, if
-there are enough, refine the coefficients, with those of the own photos as the prior. Thresholds are
-chosen on predictions of samples that the model was not fitted on (cross-validation).
+searched as if the map had no photo of a place that shows them. Levels are conditional on "in this
+map" and learn nothing from impostors: a query of another season looks as weak as they do, and is
+right. Labelled queries, if there are enough, refine the coefficients, with those of the own photos
+as the prior. Thresholds are chosen on predictions of samples that the model was not fitted on
+(cross-validation), where impostors have the total weight `UNMAPPED_SHARE`: that share of queries of
+places without a photo is assumed.
 
 An own photo that is alone at its place teaches nothing about "in the map": searched without itself,
 it is an impostor.
@@ -23,6 +25,7 @@ import numpy as np
 
 from shared.evaluation.places.levels import CandidateLevel, FloatArray, LevelScheme
 from shared.evaluation.places.probability import (
+    MIN_LABELLED_QUERIES,
     UNMAPPED_SHARE,
     Background,
     Coefficients,
@@ -41,11 +44,12 @@ from shared.evaluation.places.thresholds import (
 )
 
 MIN_OWN_PHOTOS = 20
-MIN_LABELLED_QUERIES = 40
 PRIOR_PRECISION = 2.0  # of each coefficient of a standardised feature
+OWN_PRECISION = 20.0  # the same for own photos, which do not show how queries of other days differ
 ELSEWHERE_PRECISION = 0.2  # what is known of another extractor says little
 NEWTON_STEPS = 50
 FOLDS = 5
+QUANTILES = 101  # of the scores of best photos
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,7 +116,15 @@ def fit_place_model(
     judged = labelled_held_out or own_held_out
     thresholds = tuple(choose_threshold(judged, certainty) for certainty in CERTAINTIES)
     fitted = _fit_coefficients(samples, labelled, scheme, scores)
-    model = fitted.model_copy(update={"thresholds": thresholds})
+    best = [s.levels[0].best_score for s in labelled or samples if s.left_out is None]
+    quantiles = np.quantile(best, np.linspace(0, 1, QUANTILES)) if best else np.zeros(0)
+    model = fitted.model_copy(
+        update={
+            "thresholds": thresholds,
+            "wrong_until": tuple(each.wrong_until for each in labelled_held_out),
+            "best_scores": tuple(quantiles.round(4).tolist()),
+        }
+    )
     in_map = labelled_held_out or [s for s in own_held_out if s.left_out is None]
     return FittedPlaceModel(model, in_map, impostors)
 
@@ -127,8 +139,10 @@ def _fit_coefficients(
     positions = max((len(sample.levels) for sample in [*samples, *labelled]), default=0)
     levels = []
     for position in range(positions):
-        own = fit_map_estimate(_level_table(samples, position), prior.level)
-        levels.append(fit_map_estimate(_level_table(labelled, position), own))
+        own = _level_table([s for s in samples if s.left_out is None], position)
+        width = own.features.shape[-1] if len(own.target) else 0
+        fitted = fit_map_estimate(own, prior.level_coefficients(width), precision=OWN_PRECISION)
+        levels.append(fit_map_estimate(_level_table(labelled, position), fitted))
     return PlaceModel(
         source="labelled_queries" if labelled else "own_photos",
         scheme=scheme,
@@ -165,10 +179,9 @@ class RegressionTable:
 
 
 def _level_table(samples: Sequence[PlaceSample], position: int) -> RegressionTable:
-    weights = sample_weights(samples, UNMAPPED_SHARE)
     return RegressionTable.of_rows(
-        (sample.levels[position].features, right, weight)
-        for sample, weight in zip(samples, weights, strict=True)
+        (sample.levels[position].features, right, 1.0)
+        for sample in samples
         if position < len(sample.levels) and (right := sample.is_right[position]) is not None
     )
 

@@ -9,12 +9,13 @@ regression on the features of the ranking (`level_features`). All probabilities 
 and add up to one: a level's is that of "in this map" times its own, and a level that contains the
 whole map says that the query is in it.
 
-`fit` fits the levels to a map; without a fit, the coefficients are those of generated maps.
+`fit` fits the levels to a map; without a fit, the coefficients are those of other maps.
 `thresholds` decides which level is the answer.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -25,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
+from shared.errors import Unprocessable
 from shared.evaluation.places.evidence import (
     EVIDENCE_DEPTH,
     PhotoLocation,
@@ -48,7 +50,7 @@ from shared.evaluation.places.levels import (
     ranking_spread,
     vote_weights,
 )
-from shared.evaluation.places.thresholds import CERTAINTIES
+from shared.evaluation.places.thresholds import CERTAINTIES, guaranteed_threshold, have_dropped
 from shared.geodesy import distance_m
 from shared.place_paths import label_levels
 
@@ -58,7 +60,8 @@ OUT_OF_MAP_SHARE = 0.02  # of the frames of tracks, and of queries before a map 
 UNMAPPED_SHARE = 0.05  # of queries within the map's extent whose place has no photo
 ELSEWHERE_SHARE = 0.33  # of queries that are from elsewhere, unless the caller says otherwise
 DEFAULT_CERTAINTY = 0.95
-SMALL_MAP_PHOTOS = 200  # with fewer, the coefficients stay near the prior's
+MIN_LABELLED_QUERIES = 40
+SMALL_MAP_PHOTOS = 2000  # with fewer, the coefficients stay near the prior's
 PRIOR_FILE = Path(__file__).with_name("prior.json")
 
 Coefficients = tuple[float, ...]
@@ -163,17 +166,23 @@ class MapExtent(BaseModel):
 
 
 class PlacePrior(BaseModel):
-    """Coefficients that were fitted on generated maps, and the standardisation of the features."""
+    """Coefficients that were fitted on other maps, and the standardisation of the features."""
 
     model_config = ConfigDict(frozen=True)
 
     means: tuple[float, ...]
     scales: tuple[float, ...]
     level: Coefficients
+    matched: Coefficients = ()
+    """those of a level with matches"""
     missing_place: Coefficients
     """log-odds that the map has no photo of the place, if that holds for half of the queries"""
     elsewhere: dict[str, Elsewhere] = {}
     """by extractor, for maps with a vocabulary of their own; "" for all others"""
+
+    def level_coefficients(self, features: int) -> Coefficients:
+        """Return those of a level with so many features."""
+        return self.matched if features > len(FEATURES) else self.level
 
     def design(self, features: FloatArray) -> FloatArray:
         """Return the (n, 1 + F) design matrix of (n, F) features; those of matches stay as they
@@ -232,6 +241,10 @@ class PlaceModel(BaseModel):
     extent: MapExtent = MapExtent()
     thresholds: tuple[float, ...] = ()
     """least probability of an answer, for each of CERTAINTIES"""
+    best_scores: tuple[float, ...] = ()
+    """quantiles of the score of the best photo, of the queries that the model was fitted on"""
+    wrong_until: tuple[float, ...] = ()
+    """`HeldOutEstimate.wrong_until` of the labelled queries"""
     own_photos: int = 0
     labelled_queries: int = 0
     with_matches: PlaceModel | None = None
@@ -265,14 +278,16 @@ class PlaceModel(BaseModel):
             levels: Those of `MapExtent.end_levels`.
             elsewhere: Prior probability that a query is from elsewhere.
         """
-        prior = shipped_prior()
+        prior, fitted = shipped_prior(), dict(enumerate(self.levels))
         missing = self.elsewhere.probability(levels, elsewhere) if self.elsewhere else elsewhere
         if self.is_fitted:  # Laplace's rule of succession
             missing = max(missing, 1 / (self.own_photos + self.labelled_queries + 2))
         single = [
             1.0
             if level.is_whole_map
-            else sigmoid(_log_odds(self.levels[i] if i < len(self.levels) else prior.level, level))
+            else sigmoid(
+                _log_odds(fitted.get(i, prior.level_coefficients(len(level.features))), level)
+            )
             for i, level in enumerate(levels)
         ]
         increasing = (1 - missing) * np.maximum.accumulate(np.array(single))
@@ -309,16 +324,52 @@ class PlaceModel(BaseModel):
         """Return `PlaceEstimate.in_map` of a query with these levels."""
         return self.is_in_map(self.probabilities(self.extent.end_levels(levels))[1])
 
+    def threshold(self, certainty: float, guarantee: float | None = None) -> float:
+        """Return how probable a level must be to be the answer.
+
+        Args:
+            guarantee: Share of all queries that may get a wrong answer, instead of the certainty.
+
+        Raises:
+            Unprocessable: `too_few_labelled_queries` for the guarantee.
+        """
+        if guarantee is None:
+            stored = zip(CERTAINTIES, self.thresholds, strict=False)
+            return next((t for known, t in stored if known >= certainty - 1e-9), certainty)
+        least = guaranteed_threshold(self.wrong_until, guarantee)
+        if least is None:
+            needed = max(MIN_LABELLED_QUERIES, math.ceil(1 / guarantee - 1 - 1e-9))
+            raise Unprocessable(
+                "too_few_labelled_queries",
+                f"A guarantee of {guarantee:g} takes {needed} labelled queries of another session "
+                f"than the photos that they match, and the last evaluation of the map had "
+                f"{len(self.wrong_until)}. Add photos with role=query, and evaluate the map.",
+                needed=needed,
+            )
+        return least
+
+    def is_new(self, recent: Sequence[float]) -> bool:
+        """Return whether queries are new to the map, by the scores of their best photos."""
+        return have_dropped(
+            recent, self.best_scores, self.labelled_queries or max(1, self.own_photos)
+        )
+
     def answer(
-        self, probabilities: Sequence[float], not_in_map: float, certainty: float
+        self,
+        probabilities: Sequence[float],
+        not_in_map: float,
+        certainty: float,
+        guarantee: float | None = None,
     ) -> int | None:
-        """Return the index of the finest level that is certain enough; None if none is."""
+        """Return the index of the finest level that is certain enough; None if none is.
+
+        Where "in this map" is, that is the whole map at least.
+        """
         if not self.is_in_map(not_in_map, certainty):
             return None
-        stored = zip(CERTAINTIES, self.thresholds, strict=False)
-        least = next((t for known, t in stored if known >= certainty - 1e-9), certainty)
+        least = self.threshold(certainty, guarantee)
         enough = (index for index, each in enumerate(probabilities) if each >= least)
-        return next(enough, None)
+        return next(enough, len(probabilities) - 1)
 
     def unit(self, ranking: Sequence[RankedPhoto]) -> float:
         """Return the unit of score differences for a ranking."""
@@ -333,6 +384,7 @@ class PlaceModel(BaseModel):
         position_radius_m: float,
         found: Sequence[RankedPhoto] | None = None,
         elsewhere: float = ELSEWHERE_SHARE,
+        guarantee: float | None = None,
     ) -> PlaceEstimate | None:
         """Estimate the place of a query.
 
@@ -343,6 +395,7 @@ class PlaceModel(BaseModel):
             position_radius_m: Photos within this distance of the best one determine the position.
             found: The ranking of a search with a filter; its photos determine the levels.
             elsewhere: Prior probability that the query is from elsewhere.
+            guarantee: As in `threshold`.
 
         Returns:
             The estimate; None if the ranking has no location.
@@ -370,7 +423,7 @@ class PlaceModel(BaseModel):
             location=estimate_location(ordered, position_radius_m),
             levels=levels,
             probabilities=probabilities,
-            answer=model.answer(probabilities, not_in_map, certainty),
+            answer=model.answer(probabilities, not_in_map, certainty, guarantee),
             not_in_map=not_in_map,
             in_map=model.is_in_map(not_in_map, certainty),
             radius_68_m=error_radius_m(levels, probabilities, 0.68),

@@ -24,6 +24,7 @@ from shared.matching.features import FULL_SIDE, MAX_KEYPOINTS, LocalFeatures
 from shared.matching.lightglue import LightGlueMatcher
 from shared.matching.matchers import Matcher, MutualNearest
 from shared.matching.verification import verify_matches
+from shared.matching.xfeat import refine_keypoints
 
 CPU = torch.device("cpu")
 ANGLE_DEGREES = 8.0
@@ -184,3 +185,14 @@ def test_weights_that_do_not_fit_are_refused(state: dict[str, torch.Tensor]) -> 
 def test_damaged_features_are_no_features(data: bytes) -> None:
     with pytest.raises(ValueError, match="bytes"):
         LocalFeatures.decode(data)
+
+
+def test_keypoints_of_xfeat_are_at_the_peak_of_its_response() -> None:
+    y, x = torch.meshgrid(torch.arange(16.0), torch.arange(24.0), indexing="ij")
+    response = -((x - 10.3) ** 2) - 2 * (y - 7.8) ** 2
+    for scale in (1.0, 1.5):  # of the photo, which the network resizes to 24 x 16
+        size = round(16 * scale), round(24 * scale)
+        keypoints = torch.tensor([[10.0, 8.0], [0.0, 8.0]]) * scale
+        peak, border = refine_keypoints(keypoints, response, size)
+        assert peak.tolist() == pytest.approx([10.8 * scale - 0.5, 8.3 * scale - 0.5], abs=1e-4)
+        assert border.tolist() == pytest.approx([0.5 * scale - 0.5, 8.5 * scale - 0.5], abs=1e-4)

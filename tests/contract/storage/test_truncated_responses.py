@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from lab.benchmarks.fault_injection import FaultProxy, ProxyMode
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
 from shared.storage.s3 import Bucket, S3Store
+from tests.support.fault_injection import FaultProxy, ProxyMode
 from tests.support.servers.daemon import free_ports
 from tests.support.servers.s3 import S3Server
 

@@ -35,6 +35,8 @@ from tests.integration.harness import Harness, expected_row, once, pixels_of, sa
 from tests.support.catalog_rows import end_pauses, expire_lease, problem_of, states
 from tests.support.photos import photo_bytes
 
+pytestmark = pytest.mark.databases("postgresql")
+
 DAY_SECONDS = 86_400.0
 
 

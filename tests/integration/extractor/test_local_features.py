@@ -29,8 +29,6 @@ from tests.integration.harness import Harness
 from tests.support.catalog_rows import read_job, set_columns
 from tests.support.photos import encoded, photo_bytes, turned_photo
 
-pytestmark = pytest.mark.databases("sqlite")
-
 
 def textured(number: int, size: tuple[int, int] = (400, 300)) -> Image.Image:
     """A photo full of corners: random blocks of 8 pixels."""

@@ -19,6 +19,9 @@ from tests.integration.extractor.small_gpu import make_too_heavy
 from tests.integration.harness import Harness, expected_row, same
 from tests.support.catalog_rows import problem_of, set_columns
 from tests.support.photos import photo_bytes
+from tests.support.waiting import wait_until
+
+pytestmark = pytest.mark.databases("postgresql")
 
 WAIT_SECONDS = 90.0
 BATCH = 4  # tests.integration.conftest
@@ -48,10 +51,7 @@ class Gate:
         monkeypatch.setattr("services.extractor.describe.publish", published)
 
     def await_seen(self, *expected: str) -> None:
-        deadline = time.monotonic() + WAIT_SECONDS
-        while self.seen != list(expected):
-            assert time.monotonic() < deadline, self.seen
-            time.sleep(0.01)
+        wait_until(lambda: self.seen == list(expected), WAIT_SECONDS)
 
 
 @pytest.fixture

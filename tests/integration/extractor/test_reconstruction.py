@@ -33,7 +33,7 @@ from tests.support.poses import ORIGIN, SIMILARITY
 from tests.support.problems import problem
 from tests.support.reconstructed_scene import ReconstructedScene
 
-pytestmark = [pytest.mark.databases("sqlite"), pytest.mark.numerics]
+pytestmark = pytest.mark.numerics
 
 PHOTOS = 8
 
@@ -325,6 +325,7 @@ def test_imported_model_gives_the_photos_its_poses(walk: Walk, service: Service)
             {"name": f"walk/{n}.jpg", "camera": 0, "rotation": rotation, "translation": translation}
             for n, (rotation, translation) in enumerate(poses)
         ],
+        "origin": [-33.9, 18.4, 25.0],
     }
     started = service.json("POST", "/reconstructions/import", 202, json=model)
     walk.run()
@@ -344,6 +345,11 @@ def test_imported_model_gives_the_photos_its_poses(walk: Walk, service: Service)
         assert found.centres()[row] == pytest.approx(scene.component.centres()[number], abs=1e-6)
         same = abs(quaternion_of(found.rotation(row)) @ scene.component.rotations[number])
         assert same == pytest.approx(1, abs=1e-9)
+    (about,) = made.list_components()
+    assert about.alignment is not None, about.not_aligned
+    assert about.alignment.origin == (-33.9, 18.4, 25.0)
+    placed = Similarity.from_json(about.alignment.similarity).apply(found.centres())
+    assert placed == pytest.approx(found.centres()), "the model's axes are east, north and up"
 
 
 def test_imported_model_of_other_photos_is_refused_before_anything_is_matched(

@@ -29,6 +29,8 @@ from tests.integration.harness import FIT, Harness, expected_row, same
 from tests.support.catalog_rows import failure_code, problem_of
 from tests.support.photos import photo_bytes
 
+pytestmark = pytest.mark.databases("postgresql")
+
 
 @pytest.mark.parametrize("stage", ["sample", "cluster"])
 def test_a_fit_can_be_cancelled_in_each_stage(

@@ -36,6 +36,8 @@ from tests.support.catalog_rows import add_job, add_map
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
 
+pytestmark = pytest.mark.databases("postgresql")
+
 GIGABYTE = 1_000_000_000
 Make = Callable[..., Service]
 

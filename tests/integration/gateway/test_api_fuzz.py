@@ -32,8 +32,6 @@ from shared.storage import FolderStore
 from tests.integration.api_with_keys import ADMIN, Door
 from tests.support.photos import photo_bytes
 
-pytestmark = pytest.mark.databases("sqlite")
-
 EXAMPLES = int(os.environ.get("PLACEWISE_FUZZ_EXAMPLES", "2"))  # of calls; a sixth: of sequences
 PROMISED = [
     not_a_server_error,

@@ -106,7 +106,6 @@ SPOT = {"latitude": 45.0, "longitude": 7.0}
 ANYWHERE = {**SPOT, "accuracy_m": 100_000.0}
 
 
-@pytest.mark.databases("sqlite")
 @pytest.mark.parametrize(
     ("is_located", "start", "fix"),
     [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import Any
 from uuid import UUID
@@ -14,10 +13,11 @@ from shared.catalog.database.base import db_now_plus
 from shared.catalog.maps import get_map
 from shared.catalog.processes import RegisteredProcess, process_heartbeat
 from shared.jobs import Job
-from shared.storage.trash import Hold, HoldReason, end_hold, write_hold
+from shared.storage.trash import end_hold, write_hold
 from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import add_map, set_columns
 from tests.support.photos import photo_bytes
+from tests.support.waiting import wait_until
 
 ANYLOC = "anyloc-vits14:clusters=2,layer=0"
 
@@ -52,11 +52,9 @@ def test_health_is_degraded_when_every_separate_steward_was_killed(service: Serv
 
 
 def test_health_says_why_orphans_are_not_collected(service: Service) -> None:
-    write_hold(service.store, Hold(HoldReason.ADOPTED, 3, 2_000_000, 9))
+    write_hold(service.store, "too many orphans")
     part = service.json("GET", "/health", 503)["parts"]["object_store"]
-    assert part["status"] == "degraded"
-    assert "3 of 9 objects" in part["detail"]
-    assert "placewise storage collect" in part["detail"]
+    assert part == {"status": "degraded", "detail": "too many orphans"}
     end_hold(service.store)
     assert service.json("GET", "/health")["parts"]["object_store"]["status"] == "healthy"
 
@@ -142,9 +140,8 @@ def test_extractors_are_degraded_while_a_job_waits_much_longer_than_usual(
         session.execute(
             update(Job).where(Job.photo_id == UUID(photo)).values(finished_at=db_now_plus(-120))
         )
-    deadline = time.monotonic() + 60.0  # the queue is measured every second, or less often
-    while service("GET", "/health").is_success and time.monotonic() < deadline:
-        time.sleep(0.1)
+    # The queue is measured every second, or less often.
+    wait_until(lambda: not service("GET", "/health").is_success, 60)
     part = extractors(service, 503)
     assert part["status"] == "degraded"
     assert "waited for 36" in part["detail"]

@@ -9,24 +9,23 @@ from typing import Any
 
 import httpx2
 import pytest
-from sqlalchemy import func, select, update
+from sqlalchemy import func, select
 
 from services.extractor.worker import ExtractorWorker
-from services.gateway import idempotency
 from services.gateway.routes import model_changes
-from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.idempotency import IdempotencyRecord
 from shared.catalog.photos import Photo
 from shared.config.settings import Settings
 from shared.errors import Unavailable
-from shared.imaging.photo_header import read_photo_header
 from shared.jobs import Job
 from shared.storage import FolderStore
 from tests.integration.api_with_keys import Door
 from tests.integration.in_process_api import Service
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import field_refused, problem
+
+pytestmark = pytest.mark.databases("postgresql")
 
 REPLAYED = "idempotent-replayed"
 
@@ -231,60 +230,6 @@ def test_a_server_error_is_not_stored_under_the_key(
     assert upload(service, photo_bytes(1)).status_code == 202
     assert call_fit(service, headers=keyed("fit")).status_code == 202
     assert (count(catalog, Photo), originals(store)) == (1, 1)
-
-
-def test_a_repeated_call_in_progress_gets_retry_after(service: Service, store: FolderStore) -> None:
-    """The first one stands between its claim and its commit until the second was refused."""
-    reached, go_on = threading.Event(), threading.Event()
-    reader = read_photo_header
-
-    def slowly(*arguments: Any) -> Any:
-        reached.set()
-        assert go_on.wait(timeout=30)
-        return reader(*arguments)
-
-    service.let_threads_call()
-    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(1) as pool:
-        patch.setattr("shared.ingest.validation.read_photo_header", slowly)
-        first = pool.submit(upload, service, photo_bytes(1))
-        assert reached.wait(timeout=30)
-        try:
-            refused = upload(service, photo_bytes(1))
-            problem(refused, 409, "idempotency_key_in_use")
-            assert int(refused.headers["retry-after"]) >= 1
-            problem(upload(service, photo_bytes(2)), 422, "idempotency_key_reused")
-        finally:
-            go_on.set()
-        answered = first.result()
-    assert answered.status_code == 202
-    same(answered, upload(service, photo_bytes(1)))
-    assert originals(store) == 1
-
-
-def test_a_gateway_that_was_slower_than_its_lease_has_no_effect_beside_another_ones(
-    service: Service, catalog: Catalog
-) -> None:
-    """Its lease ends in the middle; the call repeated meanwhile is the one that counts."""
-    service.indexed(1, latitude=45, longitude=7)
-    jobs = count(catalog, Job)
-    second: list[httpx2.Response] = []
-    begin = idempotency.IdempotentRequest.claim_key
-
-    def slowly(self: idempotency.IdempotentRequest, *arguments: Any) -> None:
-        begin(self, *arguments)
-        if not second:
-            with catalog.write() as session:
-                session.execute(update(IdempotencyRecord).values(lease_until=db_now_plus(-1)))
-            second.append(httpx2.Response(0))
-            second[0] = call_evaluation(service, headers=keyed())
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(idempotency.IdempotentRequest, "claim_key", slowly)
-        first = call_evaluation(service, headers=keyed())
-    problem(first, 409, "idempotency_key_in_use")
-    assert second[0].status_code == 202
-    assert count(catalog, Job) == jobs + 1
-    same(second[0], call_evaluation(service, headers=keyed()))
 
 
 @pytest.mark.parametrize("make", [call_upload, call_evaluation, call_map], ids=lambda f: f.__name__)

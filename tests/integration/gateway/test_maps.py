@@ -39,6 +39,8 @@ from tests.support.checkpoints import none_added
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
 
+pytestmark = pytest.mark.databases("postgresql")
+
 
 class Away(Exception):
     pass

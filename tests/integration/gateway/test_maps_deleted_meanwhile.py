@@ -29,6 +29,8 @@ from tests.support.catalog_rows import add_job, add_photo, read_job, states
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
 
+pytestmark = pytest.mark.databases("postgresql")
+
 
 class Away(Exception):
     pass

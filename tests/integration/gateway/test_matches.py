@@ -23,8 +23,6 @@ from tests.support.local_features import (
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 
-pytestmark = pytest.mark.databases("sqlite")
-
 PHOTOS = 5
 NO_KEYPOINTS = LocalFeatures.empty(SIZE, 64)
 

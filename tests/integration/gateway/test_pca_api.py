@@ -15,8 +15,6 @@ from shared.jobs import InProcessWakeups
 from tests.integration.in_process_api import Service
 from tests.support.problems import field_refused, problem
 
-pytestmark = pytest.mark.databases("sqlite")
-
 PHOTOS = 8
 
 

@@ -14,8 +14,6 @@ from tests.integration.in_process_api import Service
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 
-pytestmark = pytest.mark.databases("sqlite")
-
 PATHS = ("tower/7/lift", "tower/7/hall", "tower/8/lift", "tower//attic", "tower", "a")
 
 
@@ -25,9 +23,9 @@ def ask(service: Service, number: int, map_name: str = "default", **params: Any)
     return service.json("GET", f"/jobs/{job_id}/result", params={"map": map_name})
 
 
-def fit(service: Service, map_name: str = "default") -> None:
+def fit(service: Service, map_name: str = "default", **values: Any) -> None:
     """Store a place model as an evaluation of 20 photos would, with the prior's coefficients."""
-    model = PlaceModel(source="own_photos", own_photos=20)
+    model = PlaceModel(source="own_photos", own_photos=20, **values)
     with service.catalog.write() as session:
         generation = active_generation(session, get_map(session, map_name).id)
         assert generation is not None
@@ -81,6 +79,14 @@ def test_the_levels_of_a_path_are_listed_finest_first_and_ever_more_probable(
     assert ask(tower, 0, "tower")["estimate"]["certainty"] == 0.95
     assert [level["place"] for level in ask(tower, 5, "tower")["estimate"]["levels"]] == ["a", None]
     assert ask(tower, 0, "tower", certainty=1)["estimate"]["answer_level"] is None
+
+
+def test_queries_that_look_less_like_the_map_than_those_of_its_evaluation_are_new_to_it(
+    tower: Service,
+) -> None:
+    fit(tower, "tower", best_scores=[1.0] * 101)
+    asked = [ask(tower, number, "tower")["estimate"]["new_to_map"] for number in range(10, 50)]
+    assert asked == [False] * 30 + [True] * 10
 
 
 def test_the_maps_share_of_queries_from_elsewhere_counts_unless_the_request_names_one(

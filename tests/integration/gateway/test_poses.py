@@ -18,6 +18,7 @@ from PIL.ExifTags import IFD, Base
 from scipy.spatial.transform import Rotation
 
 from services.gateway.routes import similarity
+from services.gateway.similarity import pose as similarity_pose
 from services.gateway.similarity.geopose import MEDIA_TYPE
 from shared.catalog.chunks import Chunk
 from shared.catalog.generations import Generation
@@ -54,7 +55,6 @@ from tests.support.poses import (
 from tests.support.problems import problem
 from tests.support.reconstructed_scene import CAMERA, ReconstructedScene
 
-pytestmark = pytest.mark.databases("sqlite")
 NOT_ALIGNED = "2 of its photos have coordinates, and 3 are needed."
 
 
@@ -191,6 +191,40 @@ def test_component_without_coordinates_gives_a_pose_in_its_frame_and_the_reason(
     assert reason in problem(answer, 422, "no_pose")["detail"]
 
 
+def look_elsewhere(service: Service, place: dict[Any, Any]) -> None:
+    """Make every query look as if the map, whose photos are at this place, lacked its place."""
+    others = (0.0,) * (len(shipped_prior().level) - 1)
+    model = PlaceModel(
+        source="own_photos",
+        own_photos=20,
+        levels=((-5, *others),),
+        elsewhere=Elsewhere(
+            coefficients=(9.0, 0.0, 0.0),
+            matched=(9.0, 0.0, 0.0, 0.0),
+            background=Background(mean=0.0, deviation=1.0),
+        ),
+    )
+    with service.catalog.write() as session:
+        session.query(Photo).update(place)
+        session.query(Generation).one().calibration = model.model_dump(mode="json")
+
+
+@pytest.mark.parametrize("needed", [1, 1000])
+def test_enough_points_outweigh_that_coordinates_look_elsewhere(
+    service: Service,
+    scene: ReconstructedScene,
+    ids: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    needed: int,
+) -> None:
+    monkeypatch.setattr(similarity_pose, "POINTS_TO_DOUBLE_ODDS", needed)
+    reconstruct(service, scene, ids)
+    look_elsewhere(service, {"latitude": 45.0, "longitude": 7.7})
+    answer = ask(service, take_query(scene))
+    assert (answer["pose"] is None) == (needed == 1000)
+    assert answer["no_pose"] is None or "would be needed" in answer["no_pose"]
+
+
 @pytest.mark.parametrize(
     ("case", "reason"),
     [
@@ -232,20 +266,7 @@ def test_query_without_a_pose_is_answered_with_the_reason(
 
         monkeypatch.setattr(service.search, "estimate_pose", fail)
     elif case == "floor that the map lacks":
-        others = (0.0,) * (len(shipped_prior().level) - 1)
-        model = PlaceModel(
-            source="own_photos",
-            own_photos=20,
-            levels=((-5, *others),),
-            elsewhere=Elsewhere(
-                coefficients=(9.0, 0.0, 0.0),
-                matched=(9.0, 0.0, 0.0, 0.0),
-                background=Background(mean=0.0, deviation=1.0),
-            ),
-        )
-        with service.catalog.write() as session:
-            session.query(Photo).update({"place": "hall"})
-            session.query(Generation).one().calibration = model.model_dump(mode="json")
+        look_elsewhere(service, {"place": "hall"})
     elif case == "filtered":
         params = {"ids": ids[-1]}
     answer = ask(service, features, **params)
@@ -497,5 +518,7 @@ def test_a_track_takes_the_pose_of_a_frame_as_a_fix_unless_a_better_one_was_meas
         at = (fix["latitude"], fix["longitude"])
         assert distance_m(place.latitude, place.longitude, *at) < 0.5
         assert 0 < fix["accuracy_m"] < 1
+        assert fix["radius_95_m"] > fix["accuracy_m"]
+        assert 0 <= fix["heading"] < 360
     exact = fix_of(5, **measured, accuracy_m=0.01)
-    assert exact == {**measured, "accuracy_m": 0.01}
+    assert exact == {**measured, "accuracy_m": 0.01, "radius_95_m": None, "heading": None}

@@ -13,8 +13,6 @@ from tests.integration.in_process_api import Service
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 
-pytestmark = pytest.mark.databases("sqlite")
-
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
 
 

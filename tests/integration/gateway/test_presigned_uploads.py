@@ -30,8 +30,6 @@ from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 from tests.support.servers import S3Server
 
-pytestmark = pytest.mark.databases("sqlite")
-
 PHOTO = photo_bytes(1)
 
 

@@ -24,8 +24,6 @@ from tests.support.local_features import MODEL, add_features, scene_features
 from tests.support.poses import ALIGNMENT, CALIBRATION
 from tests.support.problems import problem
 
-pytestmark = pytest.mark.databases("sqlite")
-
 POSE = {"camera": 0, "rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}
 
 

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import httpx2
-import pytest
 
 from services.steward.tasks.model_changes import advance_model_changes
 from shared.jobs import InProcessWakeups
@@ -16,8 +15,6 @@ from tests.integration.in_process_api import API, Service
 from tests.support.photos import encoded, photo_bytes, photo_image
 
 # No URL depends on the database.
-pytestmark = pytest.mark.databases("sqlite")
-
 MAP = "words"
 URLS = re.compile(r".+_url|image_path")
 # With a bucket alone: tests/integration/gateway/test_presigned_uploads.py.
@@ -123,6 +120,9 @@ def test_every_url_in_an_answer_leads_to_its_map(service: Service) -> None:
     call("get_photo", "GET", f"/uploads/{file_id}")
     call("patch_photo", "PATCH", f"/uploads/{file_id}", json={"tags": ["a"]})
     call("search_metadata", "GET", "/search")
+    call("restore_photo", "POST", f"/uploads/{file_id}/restore")
+    call("patch_photo", "PATCH", f"/uploads/{file_id}", json={"place": None})
+    call("propose_places", "POST", "/places/proposals", json={})
 
     call("similar_to_stored", "POST", f"/similarity/{file_id}")
     query = {"file": ("query.jpg", photo_bytes(5))}
@@ -159,6 +159,7 @@ def test_every_url_in_an_answer_leads_to_its_map(service: Service) -> None:
     call.cancel(call("start_generation", "POST", "/generations", json=params))
     call("add_model", "POST", "/models", files=file, data={"name": "one"})
     call("evaluate", "POST", "/evaluations")
+    call.cancel(call("sync_library", "POST", "/library-syncs", json={}))
     call.cancel(call("reconstruct", "POST", "/reconstructions"))
     call.cancel(call("import_reconstruction", "POST", "/reconstructions/import", json=COLMAP))
 

@@ -13,8 +13,6 @@ from shared.storage.keys import preview_key
 from tests.integration.in_process_api import Service
 from tests.support.photos import encoded, photo_image
 
-pytestmark = pytest.mark.databases("sqlite")
-
 SERIAL = "camera-serial-0815"
 
 

@@ -145,7 +145,6 @@ def count(catalog: Catalog, table: Any) -> int:
         return session.scalar(select(func.count()).select_from(table)) or 0
 
 
-@pytest.mark.databases("sqlite")
 def test_one_track_of_a_caller_is_smoothed_at_a_time(
     service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -172,7 +171,6 @@ def test_one_track_of_a_caller_is_smoothed_at_a_time(
     assert read(service, track_id, smoothed=True)["smoothed"] is True
 
 
-@pytest.mark.databases("sqlite")
 def test_a_frame_that_is_sent_twice_is_one_frame(street: Service) -> None:
     track_id = begin(street)
     first = send(street, track_id, 0)
@@ -194,7 +192,6 @@ def test_a_frame_that_is_sent_twice_is_one_frame(street: Service) -> None:
     assert stored <= {query_key(UUID(job_id)) for job_id in originals}, "repeated photos are gone"
 
 
-@pytest.mark.databases("sqlite")
 def test_a_late_frame_changes_the_states_after_it(
     street: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -226,7 +223,6 @@ def test_a_late_frame_changes_the_states_after_it(
     assert [time.isoformat() for time in stored] == [time_of(1.5), time_of(2), time_of(3)]
 
 
-@pytest.mark.databases("sqlite")
 def test_a_frame_is_searched_without_what_the_earlier_frames_share(
     street: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -243,7 +239,6 @@ def test_a_frame_is_searched_without_what_the_earlier_frames_share(
     assert backgrounds == [[], rows[:1], rows[:2]]
 
 
-@pytest.mark.databases("sqlite")
 def test_two_clients_on_one_track_get_an_error(street: Service) -> None:
     track_id = begin(street)
     mine = send(street, track_id, 0, expected_version=0)
@@ -254,7 +249,6 @@ def test_two_clients_on_one_track_get_an_error(street: Service) -> None:
     send(street, track_id, 2, expected_version=conflict["version"])
 
 
-@pytest.mark.databases("sqlite")
 def test_two_gateways_apply_a_frame_once(street: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     track_id = begin(street)
     send(street, track_id, 0)
@@ -276,7 +270,6 @@ def test_two_gateways_apply_a_frame_once(street: Service, monkeypatch: pytest.Mo
     assert (track.version, track.revision) == (1, 1)
 
 
-@pytest.mark.databases("sqlite")
 def test_frames_are_applied_in_order_and_a_failed_one_is_left_out(street: Service) -> None:
     track_id = begin(street)
     first = send(street, track_id, 0)
@@ -294,7 +287,6 @@ def test_frames_are_applied_in_order_and_a_failed_one_is_left_out(street: Servic
     assert result["similar_images"][0]["latitude"] == 45
 
 
-@pytest.mark.databases("sqlite")
 def test_the_map_may_change_between_two_frames(street: Service) -> None:
     track_id = begin(street)
     track = ride(street, track_id, 0, 1)
@@ -321,7 +313,6 @@ def nearest(service: Service, number: int) -> str:
     return str(service.json("GET", "/search", params={"near": near})["images"][0]["image_id"])
 
 
-@pytest.mark.databases("sqlite")
 def test_measured_positions_and_a_stated_start_help(street: Service) -> None:
     alone, labelled, placed = (
         begin(street),
@@ -344,7 +335,6 @@ def test_measured_positions_and_a_stated_start_help(street: Service) -> None:
     assert smoothed[0]["state"]["probability"] >= started[0] - 1e-9
 
 
-@pytest.mark.databases("sqlite")
 def test_a_track_of_places_follows_their_labels(service: Service) -> None:
     for number in STREET:
         time = (BEGIN - timedelta(days=9) + timedelta(seconds=number)).isoformat()
@@ -357,7 +347,6 @@ def test_a_track_of_places_follows_their_labels(service: Service) -> None:
     assert track["state"]["latitude"] is None
 
 
-@pytest.mark.databases("sqlite")
 def test_a_map_whose_place_model_finds_that_it_lacks_each_frame_is_not_tracked(
     service: Service, catalog: Catalog
 ) -> None:
@@ -378,7 +367,6 @@ def test_a_map_whose_place_model_finds_that_it_lacks_each_frame_is_not_tracked(
     assert outside[-3.0] < 0.05 < 0.95 < outside[3.0]
 
 
-@pytest.mark.databases("sqlite")
 def test_rows_and_objects_of_a_track_are_deleted_with_it(street: Service, catalog: Catalog) -> None:
     pending, done = begin(street), begin(street)
     job_id = send(street, pending, 0)["job_id"]
@@ -416,7 +404,6 @@ BAD_FIELDS: list[dict[str, Any]] = [
 ]
 
 
-@pytest.mark.databases("sqlite")
 def test_invalid_fields_are_refused_by_name_and_leave_nothing(service: Service) -> None:
     track_id = begin(service)
     for fields in BAD_FIELDS:
@@ -465,7 +452,6 @@ FRAMES = st.lists(
 )
 
 
-@pytest.mark.databases("sqlite")
 def test_any_times_and_odometry_lead_to_a_state(
     street: Service, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -496,7 +482,6 @@ def test_any_times_and_odometry_lead_to_a_state(
     check()
 
 
-@pytest.mark.databases("sqlite")
 def test_a_full_track_takes_no_more(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tracks_module, "MAX_TRACK_FRAMES", 1)
     track_id = begin(service)

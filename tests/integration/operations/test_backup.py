@@ -37,6 +37,8 @@ from tests.support.catalog_rows import add_reconstruction, take
 from tests.support.photos import photo_bytes
 from tests.support.servers import PostgresServer
 
+pytestmark = pytest.mark.databases("postgresql")
+
 
 @pytest.fixture
 def other_catalog(

@@ -34,6 +34,8 @@ from tests.support.catalog_rows import add_job, add_map, expire_lease, take
 from tests.support.metrics import ADDED, exported, read
 from tests.support.photos import photo_bytes
 
+pytestmark = pytest.mark.databases("postgresql")
+
 DEPLOY = Path(__file__).parents[3] / "deploy"
 NAME = re.compile(r"\b(?:placewise_\w+|up)\b(?!\()")
 # PromQL's words and the labels that Prometheus itself gives.

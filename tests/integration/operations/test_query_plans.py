@@ -7,48 +7,28 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from sqlalchemy.engine import make_url
 
 from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
 from tests.integration.operations.query_plans.calls import KNOWN_FULL_SCANS, run_all_calls
 from tests.integration.operations.query_plans.explain import Explainer
-from tests.integration.operations.query_plans.fill import SyntheticCatalog, fill_catalog
+from tests.integration.operations.query_plans.fill import fill_catalog
 from tests.support.servers import PostgresServer
 
 # The first map has more rows than any statement may read: one that reads it all stands out.
 PHOTOS = 60_000
 
-Filled = tuple[Catalog, SyntheticCatalog]
-
-
-@pytest.fixture(scope="module")
-def filled_template(
-    postgres: PostgresServer, migrated_postgres: str
-) -> tuple[str, SyntheticCatalog]:
-    """The URL and the contents of a filled database to copy."""
-    url = postgres.new_database(migrated_postgres)
-    with contextlib.closing(_open(url)) as catalog:
-        return url, fill_catalog(catalog, PHOTOS)
-
 
 @pytest.fixture
-def filled(
-    postgres: PostgresServer, filled_template: tuple[str, SyntheticCatalog]
-) -> Iterator[Filled]:
-    """A filled catalog, which the test may change."""
-    url, contents = filled_template
-    template = make_url(url).database
-    assert template is not None
-    with contextlib.closing(_open(postgres.new_database(template))) as catalog:
-        yield catalog, contents
+def catalog(postgres: PostgresServer, migrated_postgres: str) -> Iterator[Catalog]:
+    url = postgres.new_database(migrated_postgres)
+    with contextlib.closing(Catalog(url, PoolConfig(), TransactionTimeouts(250, 250))) as opened:
+        yield opened
 
 
-def _open(url: str) -> Catalog:
-    return Catalog(url, PoolConfig(), TransactionTimeouts(250, 250))
-
-
-def test_no_statement_reads_a_whole_map(filled: Filled, tmp_path: Path) -> None:
-    catalog, contents = filled
+def test_no_statement_reads_a_whole_map_and_a_missing_index_is_noticed(
+    catalog: Catalog, tmp_path: Path
+) -> None:
+    contents = fill_catalog(catalog, PHOTOS)
     explainer = Explainer(catalog)
     calls = list(run_all_calls(catalog, contents, explainer, tmp_path))
     assert {e.call for e in explainer.plans} >= set(calls) - {
@@ -64,9 +44,6 @@ def test_no_statement_reads_a_whole_map(filled: Filled, tmp_path: Path) -> None:
     }
     assert not faulty, "\n".join(sorted(faulty))
 
-
-def test_missing_index_is_noticed(filled: Filled, tmp_path: Path) -> None:
-    catalog, contents = filled
     with catalog.engine.begin() as connection:
         connection.exec_driver_sql("DROP INDEX ix_photos_tags")
     explainer = Explainer(catalog)

@@ -50,6 +50,8 @@ from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import add_job, add_reconstruction, stored_rows
 from tests.support.photos import photo_bytes
 
+pytestmark = pytest.mark.databases("postgresql")
+
 SAID: dict[str, Any] = {
     "latitude": 45.5,
     "longitude": 7.25,
@@ -450,7 +452,7 @@ def test_bytes_are_deleted_once_the_journal_has_the_deletion(
     photos = service.indexed(1)
     service.indexed(2, map_name="other")
     write_journal(service.catalog, store)
-    service.json("DELETE", f"/uploads/{photos[0]}")
+    service.json("DELETE", f"/uploads/{photos[0]}", params={"permanently": True})
     service.json("DELETE", "/maps/other")
 
     def full(*_: Any) -> Any:

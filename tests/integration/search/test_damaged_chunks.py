@@ -24,8 +24,6 @@ from tests.integration.in_process_api import Service
 from tests.support.problems import problem
 from tests.support.servers import S3Server
 
-pytestmark = pytest.mark.databases("sqlite")
-
 
 @pytest.fixture(params=["folder", "bucket"])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> ObjectStore:

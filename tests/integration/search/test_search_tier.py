@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import threading
 import time
@@ -29,6 +30,9 @@ from shared.search_api.protocol import SearchRequest, SearchResponse
 from shared.storage import FolderStore
 from tests.support.search_tier import SearchServer, SearchTier
 from tests.support.small_map import SmallMap, assert_answers, unit_rows
+from tests.support.waiting import wait_until
+
+pytestmark = pytest.mark.databases("postgresql")
 
 BACK_SECONDS = 20.0  # for a worker that was started again to be seen: about one, in truth
 VECTOR = unit_rows(1000, 1)[0]
@@ -79,14 +83,14 @@ def test_searches_continue_when_a_replica_is_killed_and_it_serves_again_when_it_
         assert_answers(ask(tier, places), everything)
     tier.servers[0].start()
     tier.servers[1].stop()
-    deadline = time.monotonic() + BACK_SECONDS
-    while True:
-        try:
+
+    def is_back() -> bool:
+        with contextlib.suppress(Unavailable):
             assert_answers(ask(tier, places), everything)
-            return
-        except Unavailable:
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
+            return True
+        return False
+
+    wait_until(is_back, BACK_SECONDS)
 
 
 # --- who lags --------------------------------------------------------------------------------

@@ -34,6 +34,8 @@ from tests.support.catalog_rows import failure_code
 from tests.support.photos import photo_bytes
 from tests.support.waiting import wait_until
 
+pytestmark = pytest.mark.databases("postgresql")
+
 PHOTOS = 5
 WAIT_SECONDS = 30.0
 

@@ -18,6 +18,8 @@ from tests.integration.steward.batches import Batches, codes, counts, files, lin
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 
+pytestmark = pytest.mark.databases("postgresql")
+
 
 def test_each_bad_object_has_its_reason_and_the_others_come_in(batches: Batches) -> None:
     job_id = batches.start_import(

@@ -23,6 +23,8 @@ from tests.integration.harness import same
 from tests.integration.steward.chunk_map import HOUR_SECONDS, ChunkMap, Features
 from tests.support.catalog_rows import row_of, stored_rows
 
+pytestmark = pytest.mark.databases("postgresql")
+
 
 def test_small_chunks_of_an_open_slot_become_one_once_there_are_enough(chunk_map: ChunkMap) -> None:
     photo_ids = sum_of(chunk_map.chunks(2, 3))

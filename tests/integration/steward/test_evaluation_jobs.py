@@ -23,6 +23,8 @@ from tests.support.catalog_rows import add_generation, expire_lease, failure_cod
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 
+pytestmark = pytest.mark.databases("postgresql")
+
 
 @pytest.fixture
 def look_always(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -41,6 +41,8 @@ from tests.support.catalog_rows import (
     upload,
 )
 
+pytestmark = pytest.mark.databases("postgresql")
+
 
 def test_superseded_chunks_go_after_the_grace_and_not_before(chunk_map: ChunkMap) -> None:
     photo_ids = sum_of(chunk_map.chunks(2, 3))

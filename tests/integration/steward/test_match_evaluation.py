@@ -16,8 +16,6 @@ from tests.integration.evaluated_map import EvaluatedMap
 from tests.integration.steward.streets import at
 from tests.support.local_features import add_features, scene_features
 
-pytestmark = pytest.mark.databases("sqlite")
-
 PLACES = 30
 PER_PLACE = 4
 

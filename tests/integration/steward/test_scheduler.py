@@ -38,6 +38,8 @@ from tests.support.catalog_rows import (
     upload,
 )
 
+pytestmark = pytest.mark.databases("postgresql")
+
 
 @pytest.mark.databases("sqlite", "postgresql")
 def test_concurrent_garbage_collections_are_safe(chunk_map: ChunkMap) -> None:
@@ -131,7 +133,7 @@ def test_the_loop_runs_each_task(
 ) -> None:
     """One round does everything once: each task leaves its trace."""
     wakeups = InProcessWakeups()
-    soon = settings.model_copy(update={"orphan_age_seconds": 0.0})
+    soon = settings.model_copy(update={"orphan_age_seconds": 30.0})
     monkeypatch.setattr(vocabularies, "MIN_PHOTOS_TO_FIT", 1)
     monkeypatch.setattr(auto_fit, "QUIET_SECONDS", -1.0)
     retained = sum_of(chunk_map.chunks(*[1] * COMPACT_CHUNKS))

@@ -47,6 +47,8 @@ from tests.support.catalog_rows import end_pauses
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 
+pytestmark = pytest.mark.databases("postgresql")
+
 BOTH_DATABASES = pytest.mark.databases("sqlite", "postgresql")
 PHOTOS = 6
 

@@ -20,7 +20,6 @@ from shared.descriptors.aggregators.clustering import soft_vlad
 from shared.descriptors.backbones.dinov2 import SHAPES, Dinov2
 from shared.descriptors.backbones.synthetic import TinyBackbone
 from shared.descriptors.extractor import Extractor
-from shared.descriptors.vocabulary import parse_centres
 from shared.extractor_config.configs import get_extractor_config
 from shared.imaging.decode import decode_photo
 from shared.imaging.preprocessing import get_preprocessing
@@ -85,22 +84,6 @@ def test_rows_are_the_extractors_in_the_order_given(photos: list[Path], out: Pat
     assert [path.name for path in out.parent.iterdir()] == ["rows.npy"]
 
 
-def test_parts_of_an_extractor_are_options(photos: list[Path], out: Path, tmp_path: Path) -> None:
-    array = np.random.default_rng(0).standard_normal((3, 16)).astype(np.float32)
-    np.save(tmp_path / "centres.npy", array)
-    answer = run_json(
-        *photos, "--out", out, "--extractor", "test-tiny-vlad", "--aggregator", "soft-vlad",
-        "--temperature", "2.50", "--preprocessing", "demo1024",
-        "--vocabulary", tmp_path / "centres.npy",
-    )  # fmt: skip
-    name = "test-tiny-vlad:aggregator=soft-vlad,preprocessing=demo1024,temperature=2.5"
-    assert answer["spec"]["extractor"] == name
-    assert answer["spec"]["vocabulary_sha256"] == parse_centres(array).sha256
-    np.testing.assert_allclose(
-        np.load(out), expected(name, photos, parse_centres(array)), atol=1e-6
-    )
-
-
 def test_dinov2_is_described_with_weights_and_vocabulary_from_files(
     out: Path, tmp_path: Path
 ) -> None:
@@ -111,9 +94,9 @@ def test_dinov2_is_described_with_weights_and_vocabulary_from_files(
     array = np.random.default_rng(0).standard_normal((4, 384)).astype(np.float32)
     torch.save(torch.from_numpy(array), tmp_path / "c_centers.pt")
     answer = run_json(
-        photo, "--out", out, "--backbone", "dinov2_vits14", "--weights", weights, "--layer", 11,
-        "--facet", "key", "--preprocessing", "demo1024", "--aggregator", "soft-vlad",
-        "--vocabulary", tmp_path / "c_centers.pt",
+        photo, "--out", out, "--weights", weights, "--vocabulary", tmp_path / "c_centers.pt",
+        "--extractor",
+        "anyloc-vits14:layer=11,facet=key,preprocessing=demo1024,aggregator=soft-vlad",
     )  # fmt: skip
     assert answer["spec"]["extractor"] == (
         "anyloc-vits14:aggregator=soft-vlad,facet=key,layer=11,preprocessing=demo1024"
@@ -201,11 +184,10 @@ def test_interrupted_run_leaves_nothing_behind(
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["--extractor", "anyloc-vits14", "--backbone", "dinov2_vits14"], "options_contradict", ""),
-        (["--backbone", "dinov3"], "unknown_backbone", "dinov2_vits14"),
-        (["--layer", "3"], "bad_extractor_option", "'layer'"),
+        (["--extractor", "anyloc-vits14", "--checkpoint", "{centres}"], "options_contradict", ""),
+        (["--extractor", "test-tiny-avg:layer=3"], "bad_extractor_option", "'layer'"),
         (["--weights", "{centres}"], "weights_unused", "test-tiny-avg"),
-        (["--backbone", "dinov2_vits14"], "vocabulary_missing", "--vocabulary FILE"),
+        (["--extractor", "anyloc-vits14"], "vocabulary_missing", "--vocabulary FILE"),
         (["--extractor", "test-tiny-avg", "--vocabulary", "{centres}"],
          "vocabulary_unusable", "no"),
         (["--extractor", "anyloc-vits14", "--vocabulary", "{centres}"],

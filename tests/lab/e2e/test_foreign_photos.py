@@ -1,6 +1,6 @@
 """Photos of elsewhere in maps of generated and of real photos: each is asked for all other sets.
 
-The shipped coefficients were fitted on other cities and other floors. `place_prior --elsewhere`
+The shipped coefficients were fitted on other cities and other floors. `place_prior`
 prints what each of its own pairs would be answered without the map and the set (leave-one-map-out).
 """
 

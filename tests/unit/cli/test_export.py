@@ -113,28 +113,23 @@ def test_pairs_name_photos_of_one_name_by_their_paths(server: FakeServer, tmp_pa
     assert (tmp_path / "pairs.txt").read_text() == "2.jpg day-2/1.jpg\n"
 
 
-def test_geojson_has_longitude_first_and_an_estimate_for_each_query(
-    server: FakeServer, tmp_path: Path
-) -> None:
+def test_geojson_has_longitude_first(server: FakeServer, tmp_path: Path) -> None:
     server.will_answer(200, STATS)
     will_list(
         server,
         photo("a.jpg", latitude=45.5, longitude=7.25, tags=["é"]),
         photo("q.jpg", "query"),
     )
-    will_find(server, "a.jpg", latitude=45.5, longitude=7.25, in_map=True)
     out = tmp_path / "map.geojson"
-    report = export(server, "geojson", "--out", out, "--estimates")
+    report = export(server, "geojson", "--out", out)
     found = json.loads(out.read_text("utf-8"))
     assert found["type"] == "FeatureCollection"
-    one, query, estimate = found["features"]
+    one, query = found["features"]
     assert one["geometry"] == {"type": "Point", "coordinates": [7.25, 45.5]}
     assert one["properties"]["tags"] == ["é"]
     assert one["properties"]["relative_path"] == "Day 2/street.jpg"
     assert query["geometry"] is None
-    assert estimate["properties"]["query"] == query["id"]
-    assert estimate["geometry"]["coordinates"] == [7.25, 45.5]
-    assert report == {"file": str(out), "photos": 2, "estimates": 1, "skipped": 0}
+    assert report == {"file": str(out), "photos": 2}
 
 
 def test_geojson_of_an_empty_map_is_an_empty_collection(server: FakeServer, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from services.search.chunk_loader import MappedFileCache
 from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
 from shared.config.embedded_home import announce_server, lock_home
-from shared.config.private_files import create_private_file, make_private_folder
+from shared.config.private_files import create_private_file, make_private_folder, write_private
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.ids import new_id
@@ -114,3 +114,13 @@ def test_doctor_names_what_others_can_read_and_how_to_change_it(tmp_path: Path) 
     for folder in (home, photos):
         folder.chmod(0o700)
     assert "only this user" in check_permissions(settings)
+
+
+def test_a_private_file_replaces_one_that_others_can_read(tmp_path: Path) -> None:
+    for left_over in (file := tmp_path / "secret", tmp_path / ".secret.partial"):
+        left_over.write_text("of a killed process")
+        left_over.chmod(0o644)
+    write_private(file, "new")
+    assert file.read_text() == "new"
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert list(tmp_path.iterdir()) == [file]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import re
-import stat
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from services.gateway.authentication import (
     parse_bearer,
 )
 from shared.catalog.database.session import Catalog
-from shared.config.private_files import write_private
 from shared.config.settings import Settings
 from shared.errors import Forbidden, Unauthorized, Unavailable
 from shared.security.api_keys import (
@@ -194,19 +192,3 @@ def test_a_chosen_key_is_masked_and_an_empty_one_is_none(monkeypatch: pytest.Mon
     assert KEY not in repr(settings) + settings.model_dump_json()
     monkeypatch.setenv("ADMIN_KEY", "")
     assert Settings().admin_key is None
-
-
-# --- the folder ------------------------------------------------------------------------------
-
-
-def test_private_files_are_readable_by_their_owner_alone(tmp_path: Path) -> None:
-    file = tmp_path / "secret"
-    file.write_text("an old one that everyone could read")
-    file.chmod(0o644)
-    left_over = tmp_path / ".secret.partial"
-    left_over.write_text("of a killed process")
-    left_over.chmod(0o644)
-    write_private(file, "new")
-    assert file.read_text() == "new"
-    assert stat.S_IMODE(file.stat().st_mode) == 0o600
-    assert list(tmp_path.iterdir()) == [file]

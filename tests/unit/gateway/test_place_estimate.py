@@ -24,6 +24,7 @@ from shared.evaluation.places.probability import (
     PlaceModel,
     error_radius_m,
 )
+from shared.evaluation.places.thresholds import CERTAINTIES
 from shared.responses.similarity import CameraPoseResponse, EstimateResponse
 from shared.search_api.protocol import SearchHit
 from tests.support.api_responses import POSE
@@ -130,11 +131,24 @@ def test_a_query_is_in_the_map_elsewhere_or_neither_is_certain() -> None:
     certainty=st.sampled_from([0.5, 0.8, 0.95, 0.99]),
     of_labels=st.booleans(),
     pose_m=st.none() | st.floats(0.1, 3000),
+    threshold=st.none() | st.floats(0.75, 1.0),
+    wrong_until=st.none() | st.lists(st.floats(0.0, 1.0), min_size=40, max_size=40),
+    is_new=st.booleans(),
 )
 def test_headline_levels_and_fields_of_an_estimate_agree(
-    probabilities: list[float], certainty: float, of_labels: bool, pose_m: float | None
+    probabilities: list[float],
+    certainty: float,
+    of_labels: bool,
+    pose_m: float | None,
+    threshold: float | None,
+    wrong_until: list[float] | None,
+    is_new: bool,
 ) -> None:
-    model = PlaceModel(source="own_photos")
+    thresholds = () if threshold is None else (threshold,) * len(CERTAINTIES)
+    guarantee = None if wrong_until is None else 0.05
+    model = PlaceModel(
+        source="own_photos", thresholds=thresholds, wrong_until=tuple(wrong_until or ())
+    )
     last = len(probabilities) - 1
     levels = [
         CandidateLevel(
@@ -152,14 +166,14 @@ def test_headline_levels_and_fields_of_an_estimate_agree(
         location=PhotoLocation(None, None, "a") if of_labels else north(0),
         levels=levels,
         probabilities=probabilities,
-        answer=model.answer(probabilities, missing, certainty),
+        answer=model.answer(probabilities, missing, certainty, guarantee),
         not_in_map=missing,
         in_map=model.is_in_map(missing, certainty),
         radius_68_m=error_radius_m(levels, probabilities, 0.68),
         radius_95_m=error_radius_m(levels, probabilities, 0.95),
         match_probabilities=[],
     )
-    told = estimate_place(given_, certainty, 0.33, "no place")
+    told = estimate_place(given_, certainty, 0.33, "no place", is_new=is_new)
     if pose_m is not None:
         told = place_at_pose(told, pose(pose_m))
     stated = [level.probability for level in told.levels]
@@ -172,8 +186,13 @@ def test_headline_levels_and_fields_of_an_estimate_agree(
         assert ("Photos of elsewhere" in told.reason) is (told.in_map is False)
     if told.answer_level is not None:
         assert told.in_map
-        assert stated[told.answer_level] >= min(certainty, 0.95) - 1e-9
-        assert all(p < max(certainty, 0.95) for p in stated[: told.answer_level])
+        least = model.threshold(certainty, guarantee)
+        is_whole_map = told.levels[told.answer_level].whole_map
+        assert stated[told.answer_level] >= min(certainty if is_whole_map else least, 0.95) - 1e-9
+        assert all(p < max(least, 0.95) for p in stated[: told.answer_level])
+    assert (told.in_map is True) is (told.answer_level is not None)
+    assert told.new_to_map is is_new
+    assert ("new to this map" in told.reason) is (is_new and (pose_m is None or of_labels))
     if told.in_map is False:
         assert (told.latitude, told.place, told.radius_m, told.confidence) == (None,) * 4
         assert told.answer_level is None

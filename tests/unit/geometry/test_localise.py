@@ -11,7 +11,7 @@ import pytest
 from shared.geometry.cameras import Camera, CameraSource
 from shared.geometry.component import Component
 from shared.geometry.localise import LocalPose, NoPose, localise
-from shared.matching.features import LocalFeatures
+from shared.matching.features import FULL_SIDE, LocalFeatures
 from shared.matching.matchers import MutualNearest
 from tests.support.reconstructed_scene import CAMERA, ReconstructedScene, looking
 
@@ -71,6 +71,19 @@ def test_photo_of_another_size_is_localised(scene: ReconstructedScene) -> None:
         localise(query, scene.candidates, [scene.component], None, CameraSource.ESTIMATED, MATCHER)
     )
     assert np.linalg.norm(pose.position - CENTRE) < 0.5
+
+
+def test_principal_point_and_distortion_of_a_query_are_estimated_with_its_pose(
+    scene: ReconstructedScene,
+) -> None:
+    query, _ = scene.take(ROTATION, CENTRE, replace(CAMERA, radial=-0.04))
+    shift = round(0.005 * FULL_SIDE)  # turns a pose that does not know it by 0.4 degrees
+    shifted = replace(query, positions=np.clip(np.add(query.positions, (shift, 0)), 0, FULL_SIDE))
+    camera = Camera.of_focal_length(query.width, query.height, CAMERA.focal_length)
+    source = CameraSource.GIVEN
+    pose = found(localise(shifted, scene.candidates, [scene.component], camera, source, MATCHER))
+    assert angle_degrees(pose.rotation, ROTATION) < 0.2
+    assert pose.camera.radial == pytest.approx(-0.04, abs=0.02)
 
 
 def test_covariance_is_that_of_the_errors_of_many_queries(scene: ReconstructedScene) -> None:

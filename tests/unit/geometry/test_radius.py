@@ -51,7 +51,7 @@ def test_pose_has_coordinates_and_calibrated_radii() -> None:
     sigma_m = 2.0 * 0.1 * 2**0.5
     assert found.radius_68_m == pytest.approx(2 * sigma_m)
     assert found.radius_95_m == pytest.approx(4 * sigma_m)
-    assert found.heading_68_degrees == pytest.approx(np.degrees(np.hypot(0.015, 0.0035)), rel=0.01)
+    assert found.heading_68_degrees == pytest.approx(np.degrees(np.hypot(0.015, 0.0025)), rel=0.01)
     assert found.heading_95_degrees > found.heading_68_degrees
 
 
@@ -119,7 +119,7 @@ def test_errors_that_points_share_and_those_of_the_camera_model_are_in_the_radii
     pose = replace(pose_at((0.0, 50.0, 1.0), sigma=1e-4), seen_points=seen)
     depth_m = 2 * float((seen[0] - pose.position) @ pose.rotation[2])
     found = geo_pose(pose, HERE, EXACT, CALIBRATION)
-    assert found.radius_68_m == pytest.approx(1.067 * 2**0.5 * 0.0035 * depth_m, rel=0.01)
+    assert found.radius_68_m == pytest.approx(1.067 * 2**0.5 * 0.0025 * depth_m, rel=0.01)
     floor = CALIBRATION.model_copy(update={"position_floor": 0.5, "heading_floor": 0.02})
     wider = geo_pose(pose, HERE, EXACT, floor)
     assert wider.radius_95_m == pytest.approx(np.hypot(4 * 2 * 0.5, found.radius_95_m), rel=0.01)

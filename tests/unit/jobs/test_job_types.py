@@ -7,18 +7,15 @@ from services.extractor.fits import FitWorker
 from services.extractor.handlers import HANDLERS
 from shared.catalog.jobs import (
     DRAINED_JOBS,
-    EXTRACTOR_JOBS,
     FIT_WORKER_JOBS,
     JOB_TYPES,
     STATUS_PAGE_JOBS,
-    STEWARD_JOBS,
     JobKind,
 )
 
 
-def test_every_kind_of_job_has_a_type_and_is_run_by_one_process() -> None:
+def test_every_kind_of_job_has_a_type() -> None:
     assert set(JOB_TYPES) == set(JobKind)
-    assert sorted(EXTRACTOR_JOBS + STEWARD_JOBS) == sorted(JobKind)
 
 
 def test_every_kind_of_the_extractor_has_a_handler() -> None:

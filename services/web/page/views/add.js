@@ -5,7 +5,8 @@ import { fileChooser, takesDrops, takesPastes } from "../drop.js";
 import { bytes, count, plural } from "../format.js";
 import { serverSettings } from "../settings.js";
 import { localPicture } from "../photo.js";
-import { UploadQueue } from "../uploads.js";
+import { UploadQueue, addedInWords } from "../uploads.js";
+import { unplacedCard } from "./places.js";
 import { readTags } from "./photos.js";
 
 // The queue goes on while another view is looked at, as long as the page is open.
@@ -16,15 +17,18 @@ export async function showAdd(view, { signal }) {
   const details = detailsForm();
   const list = h("ul", { class: "queue" });
   const summary = h("div", { class: "summary" });
+  const unplaced = h("div", {});
+  const showUnplaced = () => unplacedCard(signal).then((card) => fill(unplaced, card), () => {}); // the next change asks again
   const take = async (files) => {
     const notes = await queue.add(files, details.read());
     if (notes.length) note(notes.join(" "));
   };
   const zone = addZone(settings, take);
   takesPastes(take, signal);
-  fill(view, zone, details.element, summary, list);
+  fill(view, zone, details.element, summary, unplaced, list);
 
   const rows = new Map();
+  let settled = null; // how many were done when the photos without a place were counted
   const draw = () => {
     if (signal.aborted) return;
     for (const entry of queue.entries) {
@@ -42,6 +46,9 @@ export async function showAdd(view, { signal }) {
       if (list.children[place] !== element) list.insertBefore(element, list.children[place] ?? null);
     });
     drawSummary(summary);
+    const { total, done, failed } = queue.figures();
+    if (total === done + failed && total !== settled) showUnplaced();
+    settled = total === done + failed ? total : null;
   };
   queue.onchange = draw;
   draw();
@@ -85,13 +92,13 @@ function detailsForm() {
 }
 
 function drawSummary(summary) {
-  const { total, done, failed, sending } = queue.figures();
+  const { total, done, failed, already, sending } = queue.figures();
   if (!total) {
     fill(summary);
     return;
   }
   const open = total - done - failed;
-  const words = open ? `${count(done)} of ${plural(total, "photo")} searchable` : failed ? `${count(done)} of ${plural(total, "photo")} added` : `${plural(total, "photo")} added`;
+  const words = open ? `${count(done)} of ${plural(total, "photo")} searchable` : failed ? `${addedInWords({ done, already })}, of ${count(total)}` : addedInWords({ done, already });
   fill(summary,
     h("div", { class: "summary-words" },
       h("h2", { role: "status" }, words),

@@ -7,6 +7,7 @@ import { count, nameOf, percent, plural, score, strength, whereabouts } from "..
 import { stateInWords, watchJob } from "../jobs.js";
 import { localPicture, mayNeedPreview, preview, thumbnail } from "../photo.js";
 import { shrinkPhoto } from "../shrink.js";
+import { corrections, giveByHand, keepAsTestPhoto } from "./correct.js";
 import { drawPose, seenPoints } from "./pose.js";
 import { drawRings, judge, measurementInWords, verdict } from "./verdict.js";
 
@@ -24,12 +25,18 @@ export async function showAsk(view, { signal, id }) {
       name: nameOf(photo),
       picture: () => preview(photo, `The query photo: ${nameOf(photo)}`),
       find: (query, onjob) => findSimilar(`/similarity/${id}`, query, null, onjob, signal),
+      // Of a photo with a place, the map knows how right the answer is.
+      keep: photo.latitude === null && photo.place === null ? (place) => giveByHand(id, place) : null,
     };
     fill(view, h("h1", {}, "Which photos show this place?"), answer);
     await showAnswer(answer, queryPhoto, signal);
     return;
   }
   const map = await readMap(signal);
+  if (map.photos === 0) {
+    fill(view, emptyMap(map));
+    return;
+  }
   const entry = askEntry(map, (file) => {
     const small = shrinkPhoto(file, map.extractor);
     const described = Promise.withResolvers();
@@ -37,6 +44,7 @@ export async function showAsk(view, { signal, id }) {
     const queryPhoto = {
       name: file.name,
       picture: () => localPicture(file, { alt: `The query photo: ${file.name}` }, shown),
+      keep: (place) => keepAsTestPhoto(file, place),
       find: async (query, onjob) => {
         const sent = await small;
         // A copy has no EXIF; it is answered all the same if that of the original can't be read.
@@ -63,6 +71,14 @@ async function showNewest(newest, signal) {
     })));
 }
 
+/** What a visitor sees first: there is nothing to ask yet. */
+const emptyMap = (map) => h("section", { class: "card empty" },
+  h("img", { src: "/console/place.svg", alt: "", width: "176", height: "144" }),
+  h("h1", {}, "Where was this taken?"),
+  h("p", { class: "lead" }, "Placewise finds out where a photo was taken by comparing it with photos whose place is known."),
+  h("a", { class: "button primary", href: "#/add" }, "Add photos"),
+  h("p", {}, `The map “${map.name}” has none yet. Your photos stay on this server.`));
+
 function askEntry(map, onfile, signal) {
   const take = (files) => {
     if (files.length) onfile(files[0].file).catch((error) => !signal.aborted && noteError(error));
@@ -84,7 +100,7 @@ function askEntry(map, onfile, signal) {
     h("div", { class: "drop-words" },
       h("h1", {}, "Where was this taken?"),
       h("p", { class: "lead" }, "Drop a photo here, paste one, or choose one. ", known),
-      map.searchable ? null : h("p", { class: "hint" }, map.photos ? `The ${plural(map.photos, "photo")} of this map are not described yet. ` : `The map “${map.name}” has no photos yet, so nothing can be found. `, map.photos ? h("a", { href: "#/status" }, "See how far it is") : h("a", { href: "#/add" }, "Add some first")),
+      map.photos > 0 && !map.searchable && h("p", { class: "hint" }, `The ${plural(map.photos, "photo")} of this map are not described yet. `, h("a", { href: "#/status" }, "See how far it is")),
       h("div", { class: "row" },
         button("Choose a photo", () => choose.click(), "primary"),
         button("Take a photo", () => camera.click(), "only-touch"),
@@ -175,7 +191,7 @@ async function showAnswer(answer, queryPhoto, signal) {
   fill(answer,
     h("section", { class: "result" },
       h("figure", { class: "query-photo" }, queryPhoto.picture(), seenPoints(found.pose), h("figcaption", {}, queryPhoto.name)),
-      h("div", { class: "verdict-column" }, verdict(found, measurement)),
+      h("div", { class: "verdict-column" }, verdict(found, measurement, photos[0]), queryPhoto.keep && corrections(found, queryPhoto.keep, signal)),
       located ? ground : null),
     h("section", {},
       h("h2", { class: "matches-title" }, photos.length ? "Most similar photos" : "No photo found"),

@@ -6,7 +6,8 @@ import { preview } from "../photo.js";
 import { coordinateTools } from "../places.js";
 
 const SVG = "http://www.w3.org/2000/svg";
-const MAX_LINES = 150; // of the most similar points; more hide the photos
+const LINES = [0, 30, 150]; // of the most similar points; more hide the photos
+const NARROW = "(max-width: 460px)"; // the photos lie below one another: lines would cover both
 
 /** Open the dialog at one of the matches; the arrow keys lead to the others. */
 export function compare(queryPhoto, { matches }, photos, index, signal) {
@@ -15,6 +16,7 @@ export function compare(queryPhoto, { matches }, photos, index, signal) {
   dialog.classList.add("wide");
   signal.addEventListener("abort", () => dialog.close());
   let redraw = () => {};
+  let most = matchMedia(NARROW).matches ? LINES[0] : LINES[1];
   const resized = new ResizeObserver(() => redraw());
   dialog.addEventListener("close", () => resized.disconnect());
 
@@ -37,16 +39,28 @@ export function compare(queryPhoto, { matches }, photos, index, signal) {
         h("div", {},
           photo.match_probability !== null && h("p", {}, h("span", { class: `strength ${strength(photo.match_probability)}` }, strength(photo.match_probability)), h("span", { class: "figure large" }, ` ${percent(photo.match_probability)}`), h("span", { class: "soft" }, " the same place")),
           h("details", {}, h("summary", {}, "Details"), h("p", { class: "soft" }, `Similarity ${score(photo.similarity_score)} (cosine)`))),
-        h("p", { class: "points", role: "status" }, points),
+        h("div", {}, h("p", { class: "points", role: "status" }, points),
+          photo.pairs?.length > 0 && linesSwitch()),
         h("div", { class: "row end" },
           h("button", { type: "button", onclick: () => show(index - 1) }, "← Previous"),
           h("button", { type: "button", onclick: () => show(index + 1) }, "Next →"))));
-    redraw = () => photo.pairs?.length && drawLines(lines, frames, photo, matches);
+    redraw = () => photo.pairs?.length && drawLines(lines, frames, photo, matches, most);
     resized.disconnect();
     frames.forEach((frame) => resized.observe(frame)); // their heights are known when the photos are loaded
   }
 
+  function linesSwitch() {
+    const choice = h("select", {}, LINES.map((number) => h("option", { value: number }, number ? `at most ${number}` : "none")));
+    choice.value = most;
+    choice.addEventListener("change", () => {
+      most = Number(choice.value);
+      redraw();
+    });
+    return h("label", { class: "check" }, h("span", {}, "Lines"), choice);
+  }
+
   dialog.addEventListener("keydown", (event) => {
+    if (event.target.matches("select")) return;
     if (event.key === "ArrowLeft") show(index - 1);
     if (event.key === "ArrowRight") show(index + 1);
   });
@@ -59,11 +73,11 @@ function pointsInWords(photo, matches) {
 }
 
 /** Lines over both frames; the pairs are in pixels of the originals. */
-function drawLines(svg, frames, photo, matches) {
+function drawLines(svg, frames, photo, matches, most) {
   const origin = svg.getBoundingClientRect();
   const [query, other] = frames.map((frame) => frame.firstChild.getBoundingClientRect());
   const place = ([x, y], area, width, height) => [area.left - origin.left + (x / width) * area.width, area.top - origin.top + (y / height) * area.height];
-  const shown = photo.pairs.slice(0, MAX_LINES);
+  const shown = photo.pairs.slice(0, most);
   svg.replaceChildren(...shown.map((pair, number) => {
     const [x1, y1] = place(pair.query, query, matches.query_width, matches.query_height);
     const [x2, y2] = place(pair.photo, other, photo.width, photo.height);

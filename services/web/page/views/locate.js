@@ -155,7 +155,7 @@ async function search(photo, map, signal) {
 }
 
 /** The points of a GPX track that have a time; every n-th of a very long one. */
-function readTrack(text, name) {
+export function readTrack(text, name) {
   const parsed = new DOMParser().parseFromString(text, "application/xml");
   const points = Array.from(parsed.getElementsByTagNameNS("*", "trkpt"), (point) => ({
     time: point.getElementsByTagNameNS("*", "time")[0]?.textContent.trim(),

@@ -1,12 +1,16 @@
 // One photo: large, where it is, its metadata, and changing them.
 
 import { ask, currentMap, get } from "../api.js";
-import { button, confirmed, field, fill, h, note, time } from "../dom.js";
+import { button, field, fill, h, note, time } from "../dom.js";
 import { bytes, degrees, nameOf, when } from "../format.js";
 import { openMap } from "../map.js";
 import { preview } from "../photo.js";
 import { coordinateTools } from "../places.js";
+import { givenInWords, undoPlaces } from "./places.js";
 import { readTags } from "./photos.js";
+import { remove } from "./trash.js";
+
+const LOOKALIKES = 5;
 
 export async function showPhoto(view, { signal, id }) {
   const photo = await get(`/uploads/${id}`, { signal });
@@ -14,24 +18,21 @@ export async function showPhoto(view, { signal, id }) {
   document.title = `${nameOf(photo)} · ${currentMap()} · Placewise`;
   const ground = h("div", { class: "ground" });
   const form = editForm(photo);
-  const remove = async () => {
-    if (!(await confirmed("Delete this photo?", `${nameOf(photo)} disappears from all answers at once. This can’t be undone.`, "Delete"))) return;
-    await ask(`/uploads/${id}`, { method: "DELETE" });
-    note(`${nameOf(photo)} is deleted.`);
-    location.hash = "#/photos";
-  };
+  const removeIt = () => remove([photo], async () => {
+    location.hash = location.hash === "#/photos" ? `#/photo/${id}` : "#/photos";
+  });
   fill(view,
     h("header", { class: "head" },
       h("h1", { class: "file-name" }, nameOf(photo)),
       h("div", { class: "row" },
         h("a", { class: "button primary", href: `#/ask/${id}` }, "Find similar"),
-        button("Delete…", remove, "danger"))),
+        button("Remove", removeIt, "danger"))),
     h("div", { class: "one-photo" },
       h("figure", { class: "large-photo" }, preview(photo)),
       h("div", { class: "beside" },
         h("section", { class: "card" }, form.element),
         h("section", { class: "card" }, ground, h("p", { class: "soft small" }, "Click into the map to move the photo there, then save.")),
-        h("section", { class: "card" }, facts(photo, job)))));
+        h("section", { class: "card" }, facts(photo, job, () => window.dispatchEvent(new HashChangeEvent("hashchange")))))));
   const map = await openMap(ground, "Where this photo was taken; click to move it", { onpick: (latitude, longitude) => {
     form.setPoint(latitude, longitude);
     draw();
@@ -48,14 +49,26 @@ export async function showPhoto(view, { signal, id }) {
   };
   form.element.addEventListener("input", () => draw());
   draw(true);
+  if (photo.latitude === null && photo.searchable) await showLookalikes(map, id, signal);
 }
 
-function facts(photo, job) {
+/** The map of a photo without coordinates opens where its look-alikes are. */
+async function showLookalikes(map, id, signal) {
+  const { similar_images: similar } = await get(`/similarity/${id}`, { method: "POST", query: { top_k: LOOKALIKES, box: "-90,-180,90,180", history: false }, signal });
+  for (const { latitude, longitude, ...one } of similar) map.point(latitude, longitude, { kind: "behind", text: `Looks like ${nameOf(one)}` });
+  map.fit();
+}
+
+function facts(photo, job, reload) {
   const state = photo.role === "query" ? "no: a test photo" : photo.searchable ? "yes" : "not yet";
   const line = (name, value) => [h("dt", {}, name), h("dd", {}, value)];
   return h("dl", { class: "facts" },
     line("Searchable", job?.state === "failed" ? h("span", { class: "bad" }, `no. ${job.error.detail}`) : state),
     photo.latitude !== null && line("Position", [degrees(photo.latitude, photo.longitude), coordinateTools(photo.latitude, photo.longitude)]),
+    photo.given_place && line("Given", [givenInWords(photo), " ", button("Undo", async () => {
+      await undoPlaces([photo.image_id]);
+      reload();
+    }, "link")]),
     line("Size", `${photo.width} × ${photo.height}, ${bytes(photo.file_size)}`),
     line("Taken", photo.captured_at ? when(photo.captured_at) : "not known"),
     line("Added", time(photo.upload_time)),

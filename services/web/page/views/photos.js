@@ -1,10 +1,12 @@
 // Browse the map's photos: filter them, see where they are, tag and delete several at once.
 
 import { ask, get } from "../api.js";
-import { button, confirmed, field, fill, h, note, noteError, openDialog, time } from "../dom.js";
-import { count, nameOf, plural, whereabouts } from "../format.js";
+import { button, field, fill, h, note, noteError, openDialog, time } from "../dom.js";
+import { count, day, folderOf, nameOf, plural, whereabouts } from "../format.js";
 import { openMap } from "../map.js";
 import { thumbnail } from "../photo.js";
+import { unplacedCard } from "./places.js";
+import { remove } from "./trash.js";
 
 const PAGE = 48;
 const ON_THE_MAP = 1000; // the API's largest page
@@ -18,9 +20,11 @@ export async function showPhotos(view, { signal }) {
   const ground = h("div", { class: "ground browse", hidden: true });
   const cut = h("p", { class: "soft small", hidden: true });
   const tools = h("div", { class: "tools", hidden: true });
+  const unplaced = h("div", {});
   let opening = null;
+  let folder = null; // of the last photo of the grid
 
-  const { form, query, setNear } = filterForm(reload);
+  const { form, query, setNear, setFolder } = filterForm(reload);
   const mapButton = button("Show the map", async () => {
     ground.hidden = cut.hidden = !ground.hidden;
     mapButton.textContent = ground.hidden ? "Show the map" : "Hide the map";
@@ -29,13 +33,15 @@ export async function showPhotos(view, { signal }) {
   });
   mapButton.setAttribute("aria-expanded", "false");
   fill(view,
-    h("header", { class: "head" }, h("h1", {}, "Photos"), h("div", { class: "row" }, mapButton, h("a", { class: "button primary", href: "#/add" }, "Add photos"))),
-    form, ground, cut, total, tools, grid, more);
+    h("header", { class: "head" }, h("h1", {}, "Photos"), h("div", { class: "row" }, mapButton, h("a", { class: "button", href: "#/trash" }, "Trash"), h("a", { class: "button primary", href: "#/add" }, "Add photos"))),
+    unplaced, form, ground, cut, total, tools, grid, more);
+  unplacedCard(signal).then((card) => fill(unplaced, card), (error) => !signal.aborted && noteError(error));
 
   async function reload() {
     chosen.clear();
     drawTools();
     fill(grid);
+    folder = null;
     await load(null);
     if (!ground.hidden) await drawMap();
   }
@@ -52,9 +58,16 @@ export async function showPhotos(view, { signal }) {
     }
     if (mine !== turn) return;
     fill(total, page.total_found === 0 ? "" : `${page.total_is_exact ? "" : "more than "}${plural(page.total_found, "photo")}`);
-    grid.append(...page.images.map((photo) => h("li", {}, card(photo))));
+    grid.append(...page.images.flatMap((photo) => [folderHeading(photo), h("li", {}, card(photo))]).filter(Boolean));
     fill(more, page.next_cursor && button("Show more", () => load(page.next_cursor)));
-    if (page.total_found === 0) fill(more, nothing(Object.values(query()).some(Boolean)));
+    if (page.total_found === 0) fill(more, nothing(Object.entries(query()).some(([name, value]) => name !== "sort" && value)));
+  }
+
+  /** The folder of a photo, where another one begins. */
+  function folderHeading(photo) {
+    const begins = folderOf(photo) !== (folder ?? "");
+    folder = folderOf(photo);
+    return begins && h("li", { class: "folder" }, folder ? [h("h2", {}, folder), button("Only this folder", () => setFolder(`${folderOf(photo)}/`), "link")] : h("h2", {}, "Without a folder"));
   }
 
   function card(photo) {
@@ -74,7 +87,8 @@ export async function showPhotos(view, { signal }) {
       h("a", { href: `#/photo/${photo.image_id}`, "aria-label": nameOf(photo) }, thumbnail(photo, "", onundescribed)),
       box, corner,
       h("p", { class: "photo-name", title: nameOf(photo) }, photo.place ?? nameOf(photo)),
-      h("p", { class: "soft" }, photo.latitude === null && photo.place ? time(photo.captured_at ?? photo.upload_time) : whereabouts({ ...photo, place: null })),
+      h("p", { class: "soft" }, photo.captured_at ? day(photo.captured_at) : ["added ", time(photo.upload_time)]),
+      (photo.latitude !== null || !photo.place) && h("p", { class: "soft" }, whereabouts({ ...photo, place: null })),
       photo.tags.length > 0 && h("p", { class: "chips" }, photo.tags.map((tag) => h("span", { class: "chip" }, tag))));
   }
 
@@ -82,7 +96,7 @@ export async function showPhotos(view, { signal }) {
     tools.hidden = chosen.size === 0;
     fill(tools, chosen.size > 0 && [
       h("strong", {}, plural(chosen.size, "photo") + " selected"),
-      button("Tag…", tagChosen), button("Delete…", deleteChosen, "danger"),
+      button("Tag…", tagChosen), button("Remove", removeChosen, "danger"),
       button("Clear selection", () => {
         for (const box of grid.querySelectorAll("input:checked")) box.checked = false;
         chosen.clear();
@@ -101,10 +115,7 @@ export async function showPhotos(view, { signal }) {
     await each((photo) => ask(`/uploads/${photo.image_id}`, { method: "PATCH", json: { tags: [...new Set([...photo.tags, ...added])] } }), "tagged");
   }
 
-  async function deleteChosen() {
-    if (!(await confirmed(`Delete ${plural(chosen.size, "photo")}?`, "They disappear from all answers at once. This can’t be undone.", "Delete"))) return;
-    await each((photo) => ask(`/uploads/${photo.image_id}`, { method: "DELETE" }), "deleted");
-  }
+  const removeChosen = () => remove([...chosen.values()], reload);
 
   async function each(change, done) {
     const photos = [...chosen.values()];
@@ -159,13 +170,16 @@ function filterForm(onchange) {
   const after = h("input", { type: "date" });
   const before = h("input", { type: "date" });
   const role = h("select", {}, h("option", { value: "" }, "All"), h("option", { value: "database" }, "Can be found"), h("option", { value: "query" }, "Test photos"));
+  const without = h("input", { type: "checkbox" });
+  const sort = h("select", {}, h("option", { value: "added" }, "Newest added first"), h("option", { value: "taken" }, "Newest taken first, dated ones only"));
   let timer;
   const changed = () => {
     clearTimeout(timer);
     timer = setTimeout(() => onchange().catch(noteError), TYPING_MS);
   };
   const form = h("form", { class: "filters card", role: "search", "aria-label": "Filter the photos", oninput: changed, onsubmit: (event) => event.preventDefault() },
-    field("Name", name), field("Tags", tags),
+    field("Name or folder", name), field("Tags", tags), field("Order", sort),
+    h("label", { class: "check" }, without, h("span", {}, "Without a place")),
     h("details", {}, h("summary", {}, "More filters"), h("div", { class: "filters-more" },
       field("Near", near, "Or click into the map"), field("Within metres", radius),
       field("Taken from", after), field("Taken until", before), field("Use", role))));
@@ -178,7 +192,13 @@ function filterForm(onchange) {
       captured_after: after.value,
       captured_before: before.value && `${before.value}T23:59:59`,
       role: role.value,
+      without_place: without.checked || "",
+      sort: sort.value,
     }),
+    setFolder: (path) => {
+      name.value = path;
+      changed();
+    },
     setNear: (latitude, longitude) => {
       near.value = `${latitude.toFixed(6)}, ${longitude.toFixed(6)}`;
       form.querySelector("details").open = true;

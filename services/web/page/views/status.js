@@ -5,12 +5,13 @@ import { button, fill, h, time } from "../dom.js";
 import { bytes, count, duration, score } from "../format.js";
 import { stateInWords } from "../jobs.js";
 import { serverSettings } from "../settings.js";
+import { drawLibrary } from "./library.js";
 import { judge, measurementInWords } from "./verdict.js";
 
 const LOOK_SECONDS = 5;
 
 export async function showStatus(view, { signal }) {
-  const drawn = { health: h("section", { class: "card" }), figures: h("section", { class: "card" }), jobs: h("section", { class: "card" }), searches: h("section", { class: "card" }) };
+  const drawn = { health: h("section", { class: "card" }), figures: h("section", { class: "card" }), library: h("section", { class: "card", hidden: true }), jobs: h("section", { class: "card" }), searches: h("section", { class: "card" }) };
   const settings = await serverSettings();
   const look = async () => {
     const [health, stats, map, { jobs }, { searches }] = await Promise.all([
@@ -22,13 +23,14 @@ export async function showStatus(view, { signal }) {
     const failed = stats.failed_images ? (await get("/search", { query: { failed: true, limit: 12 }, signal })).images : [];
     drawFigures(drawn.figures, stats, map, failed, look);
     drawJobs(drawn.jobs, jobs, look);
+    await drawLibrary(drawn.library, signal);
     drawSearches(drawn.searches, searches);
   };
   await look();
-  fill(view, h("header", { class: "head" }, h("h1", {}, "Status"), h("p", { class: "row" }, h("a", { class: "button", href: "/docs" }, "The API"))), h("div", { class: "status-grid" }, Object.values(drawn), phoneCard(settings)));
+  fill(view, h("header", { class: "head" }, h("h1", {}, "Status"), h("p", { class: "row" }, h("a", { class: "button", href: "/docs" }, "The API"))), h("div", { class: "status-grid" }, drawn.figures, drawn.health), drawn.library, drawn.jobs, drawn.searches, phoneCard(settings));
   const timer = setInterval(() => {
     // Not while someone is at a button of what would be drawn anew.
-    if (!document.hidden && ![drawn.jobs, drawn.figures].some((card) => card.contains(document.activeElement))) look().catch((error) => !signal.aborted && drawUnreachable(drawn.health, error));
+    if (!document.hidden && ![drawn.jobs, drawn.figures, drawn.library].some((card) => card.contains(document.activeElement))) look().catch((error) => !signal.aborted && drawUnreachable(drawn.health, error));
   }, LOOK_SECONDS * 1000);
   signal.addEventListener("abort", () => clearInterval(timer));
 }
@@ -41,7 +43,7 @@ function drawUnreachable(card, error) {
     h("p", { class: "soft" }, "What you see here is of the last answer. The page keeps trying."));
 }
 
-const PARTS = { catalog: "Catalog", object_store: "Object store", search: "Search", extractors: "Extractors", uploads: "Uploads", stewards: "Stewards" };
+const PARTS = { catalog: "Catalog", object_store: "Object store", search: "Search", queue: "Queue", extractors: "Extractors", uploads: "Uploads", stewards: "Stewards" };
 
 function drawHealth(card, health) {
   const { load } = health;
@@ -62,10 +64,12 @@ function drawFigures(card, stats, map, failed, look) {
     h("div", { class: "tiles" },
       tile(count(stats.total_images), "photos"), tile(count(stats.searchable_images), "searchable"),
       tile(count(map.located), "with coordinates or a label"),
-      stats.failed_images > 0 && tile(count(stats.failed_images), "could not be described"),
-      tile(count(stats.labelled_queries), "test photos"), tile(bytes(stats.total_storage_bytes), "stored"),
-      tile(count(stats.total_searches), "searches"), tile(stats.avg_processing_time_ms === null ? "–" : `${stats.avg_processing_time_ms.toFixed(0)} ms`, "a search, on average")),
+      stats.failed_images > 0 && tile(count(stats.failed_images), "could not be described")),
     h("p", {}, measurementInWords(map, look)),
+    h("dl", { class: "facts" },
+      h("dt", {}, "Test photos"), h("dd", {}, count(stats.labelled_queries)),
+      h("dt", {}, "Stored"), h("dd", {}, bytes(stats.total_storage_bytes)),
+      h("dt", {}, "Searches"), h("dd", {}, `${count(stats.total_searches)}${stats.avg_processing_time_ms === null ? "" : `, ${stats.avg_processing_time_ms.toFixed(0)} ms on average`}`)),
     failed.length > 0 && h("p", {}, "Photos that could not be described, and are not found: ", failed.flatMap((photo, index) => [index > 0 && ", ", h("a", { href: `#/photo/${photo.image_id}` }, photo.original_filename)]), stats.failed_images > failed.length && ` and ${count(stats.failed_images - failed.length)} more`, "."));
 }
 
@@ -77,7 +81,7 @@ function drawJobs(card, jobs, look) {
   fill(card, h("h2", {}, "Newest jobs"), h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Newest jobs" }, h("table", {},
     h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Job"), h("th", { scope: "col" }, "State"), h("th", { scope: "col", class: "number wide-only" }, "Done"), h("th", { scope: "col" }, "Begun"), h("th", { scope: "col" }, h("span", { class: "visually-hidden" }, "What can be done")))),
     h("tbody", {}, jobs.map((job) => h("tr", {},
-      h("td", {}, job.file_id ? h("a", { href: `#/photo/${job.file_id}` }, job.filename ?? job.label) : job.filename ?? job.label, job.filename && h("p", { class: "soft small" }, job.label)),
+      h("td", { class: "name" }, job.file_id ? h("a", { href: `#/photo/${job.file_id}` }, job.filename ?? job.label) : job.filename ?? job.label, job.filename && h("p", { class: "soft small" }, job.label)),
       h("td", {}, h("span", { class: `chip ${job.state}` }, stateInWords(job)), job.error && h("p", { class: "bad small" }, job.error.detail)),
       h("td", { class: "number wide-only" }, job.progress.total ? `${count(job.progress.done)} / ${count(job.progress.total)}` : "–"),
       h("td", {}, time(job.created_at)),

@@ -2,38 +2,50 @@
 
 import { post } from "../api.js";
 import { button, h } from "../dom.js";
-import { count, degrees, metres, percent, plural } from "../format.js";
+import { count, day, degrees, folderOf, metres, percent, plural } from "../format.js";
 import { coordinateTools } from "../places.js";
 import { poseInWords } from "./pose.js";
 
 const RINGS = [[0.95, "radius_95_m", "ring-95"], [0.68, "radius_68_m", "ring-68"]];
 
-/** The card with the estimate of a similarity search; `measurement` is an element with `measurementInWords`, null for an estimate with probabilities. */
-export function verdict(found, measurement) {
+/** The card with the estimate of a similarity search: one sentence and one position, the rest folded. `measurement` is an
+ * element with `measurementInWords`, null for an estimate with probabilities; `best` the photo that is shown first. */
+export function verdict(found, measurement, best) {
   const { estimate, matches_without_place: without } = found;
   const [kind, title] = judge(estimate);
   const anyFound = found.similar_images.length > 0;
   const bars = estimate.levels.length > 0 && shares(estimate);
+  const pose = poseInWords(found.pose);
+  const reason = measurement ?? h("p", { class: "reason" }, estimate.reason);
   return h("div", { class: `verdict ${kind}` },
     h("p", { class: "badge" }, title),
     h("p", { class: "headline" }, estimate.headline),
-    kind === "unknown" ? null : whereabouts(estimate),
-    poseInWords(found.pose),
-    measurement ?? h("p", { class: "reason" }, estimate.reason),
-    without > 0 && without < found.total_similar && h("p", { class: "soft" }, `${count(without)} of these ${plural(found.total_similar, "photo")} ${without === 1 ? "has" : "have"} neither coordinates nor a label. The estimate is that of the photos that have.`),
-    bars && kind !== "unknown" && [drawBars(bars), ringsInWords(estimate)],
-    source(estimate),
+    kind === "unknown" || !best ? null : looksLike(best),
+    kind === "unknown" ? null : whereabouts(pose ? { ...estimate, latitude: null } : estimate),
+    pose,
+    !bars && reason,
+    found.missing.length > 0 && h("p", { class: "hint bad" }, `Degraded: a part of the map could not be searched (${found.missing.join(", ")}).`),
     h("details", {}, h("summary", {}, "Details"),
+      bars && reason,
+      bars && kind !== "unknown" && [drawBars(bars), ringsInWords(estimate)],
+      source(estimate),
+      without > 0 && without < found.total_similar && h("p", { class: "soft" }, `${count(without)} of these ${plural(found.total_similar, "photo")} ${without === 1 ? "has" : "have"} neither coordinates nor a label. The estimate is that of the photos that have.`),
+      anyFound && found.vocabulary === "foreign" && h("p", { class: "hint" }, "This map uses a vocabulary fitted on photos of other places. ", h("a", { href: "#/model" }, "Fit its own"), " and the right place comes first more often."),
+      anyFound && found.vocabulary === "provisional" && h("p", { class: "hint" }, "This map’s vocabulary was fitted on too few photos. ", h("a", { href: "#/model" }, "Fit it again"), " when it has 50 or more."),
       h("dl", { class: "facts" },
         bars && [h("dt", {}, "Not in this map"), h("dd", {}, percent(estimate.not_in_map_probability))],
         h("dt", {}, "Compared"), h("dd", {}, `${count(found.rows_scanned)} rows, ${found.certificate}`),
         h("dt", {}, "Ranked by"), h("dd", {}, "similarity"),
         h("dt", {}, "Took"), h("dd", {}, `${found.processing_time_ms.toFixed(0)} ms`),
         (found.no_pose ?? found.pose?.reason) && [h("dt", {}, "Pose"), h("dd", {}, found.no_pose ?? found.pose.reason)],
-        h("dt", {}, "Vocabulary"), h("dd", {}, found.vocabulary))),
-    anyFound && found.vocabulary === "foreign" && h("p", { class: "hint" }, "This map uses a vocabulary fitted on photos of other places. ", h("a", { href: "#/model" }, "Fit its own"), " and the right place comes first more often."),
-    anyFound && found.vocabulary === "provisional" && h("p", { class: "hint" }, "This map’s vocabulary was fitted on too few photos. ", h("a", { href: "#/model" }, "Fit it again"), " when it has 50 or more."),
-    found.missing.length > 0 && h("p", { class: "hint bad" }, `Degraded: a part of the map could not be searched (${found.missing.join(", ")}).`));
+        h("dt", {}, "Vocabulary"), h("dd", {}, found.vocabulary))));
+}
+
+/** The folder and the day of the most probable photo: where to look for the same trip. */
+function looksLike(photo) {
+  const folder = folderOf(photo);
+  if (!folder && !photo.captured_at) return null;
+  return h("p", { class: "looks-like" }, "Looks like ", folder && h("em", {}, folder), folder && photo.captured_at && ", ", photo.captured_at && day(photo.captured_at));
 }
 
 /** Draw the circles that contain the true position with 95 % and 68 %; without them, the estimated position. */

@@ -21,13 +21,12 @@ from services.steward.evaluation_search import read_geotagged_photos
 from services.steward.scheduler import Scheduler
 from shared.catalog.chunks import Descriptor, list_live_chunks, list_live_filter_values
 from shared.catalog.database.session import Catalog
-from shared.catalog.jobs import STEWARD_JOBS
 from shared.catalog.photos import Photo, PhotoRole, list_photos_changed_since
 from shared.catalog.processes import upsert_search_worker
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
 from shared.ids import new_id
-from shared.jobs import InProcessWakeups, Job, JobState
+from shared.jobs import InProcessWakeups, Job, JobKind, JobState
 from shared.jobs.claim import claim_jobs, mark_started
 from shared.jobs.leases import extend_lease, lock_leased_jobs
 from shared.jobs.transitions import requeue_job
@@ -245,7 +244,9 @@ def _extractor_calls(catalog: Catalog) -> Iterator[tuple[str, Callable[[], objec
 
     def claim_evaluations() -> None:
         with catalog.write() as session:
-            claim_jobs(session, worker="explained", limit=1, lease_seconds=60, kinds=STEWARD_JOBS)
+            claim_jobs(
+                session, worker="explained", limit=1, lease_seconds=60, kinds=[JobKind.EVALUATE]
+            )
 
     yield "extractor: claim a batch", claim_batch
     yield "extractor: hold the lease", extend

@@ -24,8 +24,8 @@ from lab.benchmarks.report import Report
 from services.cli.main import build_app
 from shared.errors import Misconfigured
 from shared.evaluation.places.evidence import PhotoLocation
-from shared.evaluation.places.fit import MIN_LABELLED_QUERIES
 from shared.evaluation.places.levels import LevelScheme
+from shared.evaluation.places.probability import MIN_LABELLED_QUERIES
 
 PLACES, PER_PLACE, FLOORS = 24, 6, 8
 

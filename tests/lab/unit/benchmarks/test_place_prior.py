@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.benchmarks.place_prior import OWN, PASSING, QUERIES, fit_log_odds
+from lab.benchmarks.place_prior import OWN, PASSING, QUERIES, fit_elsewhere, fit_levels
+from shared.evaluation.places.fit import PlaceSample
+from shared.evaluation.places.levels import FEATURES, CandidateLevel
+from shared.evaluation.places.probability import shipped_prior
 
 pytestmark = pytest.mark.numerics
 
@@ -13,15 +16,25 @@ pytestmark = pytest.mark.numerics
 def test_one_in_twenty_photos_of_each_set_passes_and_a_feature_that_misleads_has_no_weight() -> (
     None
 ):
-    """The second feature is larger for photos of elsewhere; one set is harder than the other."""
+    """The second feature is larger for photos of elsewhere; one set is harder than the others."""
     rng = np.random.default_rng(0)
-    means = {OWN: (8, 0), QUERIES: (6, 0), "easy": (1, 2), "hard": (3, 2)}
+    means = {QUERIES: (8, 0), "easy": (1, 2), "hard": (3, 2), "other": (1, 2)}
     maps = [{name: rng.normal(mean, 1, (60, 2)) for name, mean in means.items()} for _ in range(3)]
-    intercept, *slopes = fit_log_odds(maps)
+    intercept, *slopes = fit_elsewhere([(str(n), each) for n, each in enumerate(maps)])
     assert slopes[0] < 0 == slopes[1]
     passing = {
         name: [np.mean(intercept + each[name] @ np.array(slopes) <= PASSING) for each in maps]
         for name in means
     }
     assert max(*passing["easy"], *passing["hard"]) <= 0.05
-    assert min(passing[OWN]) > 0.9
+    assert min(passing[QUERIES]) > 0.9
+
+
+def test_levels_learn_as_much_from_a_few_queries_as_from_many_own_photos() -> None:
+    """Own photos with the same features are right, the queries wrong: neither outvotes."""
+    levels = [CandidateLevel(radius_m=25.0, features=np.zeros(len(FEATURES)))]
+    own = [PlaceSample(number, levels, [True]) for number in range(90)]
+    asked = [PlaceSample(number, levels, [False]) for number in range(10)]
+    intercept, *slopes = fit_levels([{OWN: own, QUERIES: asked}])
+    design = shipped_prior().design(levels[0].features[None])[0]
+    assert design @ np.array([intercept, *slopes]) == pytest.approx(0.0, abs=1e-3)

@@ -1,15 +1,19 @@
-"""What `placewise compare --extractors` means, and which descriptors are worth their price."""
+"""What `placewise compare --extractors` means, and charts of reports."""
 
 from __future__ import annotations
 
 import base64
-import math
+import csv
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lab.cli.evaluation.compare_extractors import ComparisonEntry, parse_entries
+from lab.evaluation.query_clusters import singleton_clusters
 from lab.evaluation.report.charts import percent_chart, render_chart
-from lab.evaluation.report.comparison import pareto_front
+from lab.evaluation.report.tables import write_tables
+from lab.evaluation.retrieval_metrics import compute_metrics
 from shared.errors import InvalidRequest
 
 
@@ -30,14 +34,6 @@ def test_invalid_lists_of_extractors_are_refused(text: str) -> None:
     assert refused.value.code == "bad_extractors"
 
 
-def test_the_pareto_front_holds_extractors_that_none_dominates() -> None:
-    prices = [1.0, 2.0, 2.0, 3.0, 4.0, math.nan]
-    worths = [0.5, 0.7, 0.6, 0.7, 0.9, 1.0]
-    # dearer and worse than the second; as good and dearer; not measured
-    assert pareto_front(prices, worths) == [True, True, False, False, True, False]
-    assert pareto_front([1.0, 1.0], [0.5, 0.5]) == [True, True], "neither beats the other"
-
-
 def test_equal_charts_have_equal_bytes_and_their_labels_are_text() -> None:
     def chart() -> str:
         figure, axes = percent_chart("metres", "recall", x_ticks=(1, 10), log=True)
@@ -51,3 +47,14 @@ def test_equal_charts_have_equal_bytes_and_their_labels_are_text() -> None:
     svg = base64.b64decode(one.partition("base64,")[2].partition('"')[0]).decode()
     assert "all queries" in svg
     assert "dc:date" not in svg
+
+
+def test_names_of_extractors_are_text_in_latex(tmp_path: Path) -> None:
+    ranked = np.array([[0, 1], [1, 0]])
+    measured = compute_metrics(ranked, [np.array([0]), np.array([0])], singleton_clusters(2))
+    write_tables(tmp_path, [(r"a_b+pca50%~C:\d", measured)])
+    _, row = (tmp_path / "table.tex").read_text().splitlines()
+    assert row.startswith(r"a\_b+pca50\%\textasciitilde{}C:\textbackslash{}d & 50.0 & ")
+    header, values = csv.reader((tmp_path / "table.csv").read_text().splitlines())
+    assert header[:5] == ["name", "queries", "R@1", "R@1 low", "R@1 high"]
+    assert values[:5] == [r"a_b+pca50%~C:\d", "2", "0.5", "", ""]

@@ -94,7 +94,7 @@ def test_lists_give_names_and_metres_to_a_report(tmp_path: Path, files: tuple[Pa
         "--predictions", files[0], "--ground-truth", files[1], "--out", out, *lists(tmp_path)
     )
     assert answer["distance_error"]["queries"] == 5
-    (table,) = out.glob("*.csv")
+    (table,) = out.glob("predictions_*.csv")
     first = table.read_text().splitlines()[1].split(",")
     assert first[0].startswith("queries/@500000.00")
     assert first[2].startswith("database/@500040.00")

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import binomtest
 
 from lab.datasets.dataset import DatasetPhoto
 from lab.evaluation.paired_runs import paired_differences
@@ -24,7 +25,7 @@ from lab.evaluation.retrieval_metrics import (
     match_distances,
     precision_recall,
 )
-from shared.evaluation.bootstrap import MIN_CLUSTERS, bootstrap_intervals
+from shared.evaluation.bootstrap import MIN_CLUSTERS, bootstrap_intervals, share_intervals
 
 pytestmark = pytest.mark.numerics
 
@@ -130,6 +131,23 @@ def test_interval_is_that_of_the_binomial_where_queries_are_independent() -> Non
     assert found[0].low == pytest.approx(0.2076, abs=0.006)
     assert found[0].high == pytest.approx(0.2924, abs=0.006)
     assert bootstrap_intervals(values, np.arange(400) % (MIN_CLUSTERS - 1)) is None
+
+
+def test_a_share_of_0_or_100_percent_has_the_interval_of_wilson_over_the_clusters() -> None:
+    values = np.repeat([[0.0, 1.0, 0.0]], 40, axis=0)
+    values[:20, 2] = 1.0
+    for per_cluster in (1, 4):
+        clusters = np.arange(40) // per_cluster
+        found = share_intervals(values, clusters)
+        bootstrap = bootstrap_intervals(values, clusters)
+        assert found is not None
+        assert bootstrap is not None
+        count = 40 // per_cluster
+        wilson = binomtest(0, count).proportion_ci(method="wilson")
+        assert found[0].as_json() == pytest.approx([0.0, wilson.high], abs=1e-6)
+        assert found[1].as_json() == pytest.approx([1 - wilson.high, 1.0], abs=1e-6)
+        assert found[2] == bootstrap[2], "others are those of the bootstrap"
+    assert share_intervals(values, np.arange(40) % (MIN_CLUSTERS - 1)) is None
 
 
 def test_copies_of_queries_in_their_clusters_make_no_interval_narrower() -> None:

@@ -116,9 +116,7 @@ def result(
     *, inside: bool, right: bool, status: TrackStatus = "tracking", start: bool = False
 ) -> FrameResult:
     probability = 0.9 if right else 0.1
-    return FrameResult(
-        0, inside, start, right, right, right, right, right, 0.5, probability, status
-    )
+    return FrameResult(0, inside, start, right, right, right, right, 0.5, probability, status)
 
 
 def test_figures_count_the_frames_until_a_place_is_found_and_until_a_track_is_lost() -> None:

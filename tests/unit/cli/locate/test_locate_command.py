@@ -22,7 +22,7 @@ from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 from typer.testing import CliRunner, Result
 
-from services.cli.locate import command, preview, undo_journal, writers
+from services.cli.locate import preview, undo_journal, writers
 from services.cli.locate.folder import read_folder, read_gpx
 from services.cli.locate.sidecars import add_position
 from services.cli.main import build_app
@@ -31,7 +31,7 @@ from shared.imaging.photo_header import read_photo_header
 from shared.ingest.photo_metadata import read_csv_manifest
 from tests.support.api_responses import PHOTO, POSE, SIMILAR, STATS
 from tests.support.fake_server import FakeServer
-from tests.support.photos import encoded, exif_with_position, photo_image, sidecar_position
+from tests.support.photos import encoded, exif_with_position, photo_image
 
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
 LATITUDE, LONGITUDE = 45.0691, 7.6853
@@ -101,17 +101,6 @@ def write_gpx(path: Path, points: Sequence[tuple[float, float]]) -> Path:
     return path
 
 
-def test_a_photo_is_placed_between_its_neighbours_of_the_same_camera(folder: Path) -> None:
-    found = proposals(folder)
-    assert found.keys() == {"day 1/2.jpg", "4.jpg"}
-    position = found["day 1/2.jpg"]["position"]
-    assert position["latitude"] == pytest.approx(LATITUDE + 20 * DEGREES_PER_M, abs=1e-5)
-    assert position["longitude"] == pytest.approx(LONGITUDE, abs=1e-5)
-    assert position["reason"] == "taken 20 s after 1.jpg"
-    assert found["day 1/2.jpg"]["accepted"]
-    assert found["4.jpg"]["position"] is None, "another camera was perhaps elsewhere"
-
-
 def test_cameras_that_travelled_together_are_neighbours_of_each_other(folder: Path) -> None:
     assert proposals(folder, "--together")["4.jpg"]["accepted"]
     (folder / "5.jpg").write_bytes(photo(30, offset=None, camera="third"))
@@ -146,17 +135,6 @@ def test_a_clock_that_was_ahead_is_put_right(folder: Path, tmp_path: Path) -> No
     found = proposals(folder, "--gpx", track, "--clock-offset", "3600")["4.jpg"]
     expected = pytest.approx(LATITUDE + 25 * DEGREES_PER_M, abs=2e-5)
     assert found["position"]["latitude"] == expected
-
-
-def test_a_date_that_no_camera_meant_is_no_time_and_stops_nothing(folder: Path) -> None:
-    exif = Image.Exif()
-    exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = "0001:01:01 00:00:00"
-    (folder / "5.jpg").write_bytes(encoded(photo_image(1), "JPEG", exif=exif))
-    found = proposals(folder, "--time-zone", "+02:00", "--clock-offset", "5")
-    assert (found["5.jpg"]["captured_at"], found["5.jpg"]["position"]) == (None, None)
-    assert found["day 1/2.jpg"]["accepted"]
-    found = proposals(folder, "--clock-offset", "5")
-    assert found["5.jpg"]["captured_at"] is None
 
 
 def test_tracks_without_times_are_refused(tmp_path: Path) -> None:
@@ -220,26 +198,6 @@ def test_proposals_are_listed_and_nothing_is_written_unless_it_is_requested(fold
     assert rows[1][0] == "4.jpg"
     assert rows[1][5] == "nothing is known about its place"
     assert rows[2][3:] == ["100 m", rows[2][4], "taken 20 s after 1.jpg"]
-
-
-def test_sidecars_are_written_for_accepted_proposals_and_undone(folder: Path) -> None:
-    before = contents(folder)
-    written = run(folder, "--write", "sidecar")
-    assert written.exit_code == 0, written.output
-    assert "1 files written: day 1/2.jpg.xmp" in written.stderr
-    assert written.stderr.rstrip().endswith(f" locate {folder} --undo")
-    position = sidecar_position((folder / "day 1" / "2.jpg.xmp").read_bytes())
-    assert position == pytest.approx((LATITUDE + 20 * DEGREES_PER_M, LONGITUDE), abs=1e-5)
-    assert proposals(folder).keys() == {"4.jpg"}, "it has coordinates now"
-    undone = run(folder, "--undo")
-    assert (undone.exit_code, "1 removed" in undone.stderr) == (0, True)
-    assert contents(folder) == before
-    assert "nothing_to_undo" in run(folder, "--undo").stderr
-
-
-def test_a_proposal_that_is_not_probable_enough_is_not_written(folder: Path) -> None:
-    assert run(folder, "--accept", "0.9999", "--write", "sidecar").exit_code == 0
-    assert not list(folder.rglob("*.xmp"))
 
 
 @pytest.mark.parametrize("latitude", [LATITUDE, -LATITUDE])
@@ -562,29 +520,6 @@ def test_a_place_that_is_not_probable_enough_is_not_written_with_the_position(
     table = (folder / "placewise-locations.csv").read_bytes()
     entries = {entry.name: entry.fields.keys() for entry in read_csv_manifest(table, "table")}
     assert entries["day 1/2.jpg"] == {"latitude", "longitude"}
-
-
-@pytest.mark.parametrize("target", ["sidecar", "exif"])
-def test_a_photo_that_got_coordinates_or_was_moved_during_the_searches_is_left_alone(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, target: str
-) -> None:
-    (folder / "5.jpg").write_bytes(photo(25))
-    located, moved, changed = (folder / name for name in ("day 1/2.jpg", "5.jpg", "6.jpg"))
-    changed.write_bytes(photo(30))
-
-    def write_later(*arguments: Any) -> Any:
-        located.write_bytes(photo(20, 5.0))
-        moved.unlink()
-        return writers.write_locations(*arguments)
-
-    monkeypatch.setattr(command, "write_locations", write_later)
-    result = run(folder, "--write", target)
-    assert result.exit_code == 1
-    assert "day 1/2.jpg: got coordinates meanwhile" in result.stderr
-    assert "5.jpg: was moved or deleted meanwhile" in result.stderr
-    assert "1 files written: 6.jpg" in result.stderr
-    assert located.read_bytes() == photo(20, 5.0)
-    assert not (folder / "5.jpg.xmp").exists()
 
 
 def test_a_photo_that_is_changed_while_its_exif_is_written_keeps_the_change(

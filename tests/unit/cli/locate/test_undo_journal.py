@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from filelock import FileLock
 
 from services.cli.locate.undo_journal import FOLDER, JOURNAL, open_journal, undo
-from shared.errors import Conflict, Misconfigured, NotFound, Unprocessable
+from shared.errors import Misconfigured, NotFound, Unprocessable
 
 MOMENTS = 40
 """More than there are moments at which a call is killed below"""
@@ -98,18 +97,6 @@ def test_undo_restores_changed_files_and_removes_new_ones(folder: Path) -> None:
     assert (folder / "old.xmp").stat().st_mtime_ns == modified
     with pytest.raises(NotFound, match="no journal"):
         undo(folder)
-
-
-def test_a_file_that_was_changed_since_is_left_as_it_is(folder: Path) -> None:
-    write(folder, "old.xmp", b"ours")
-    write(folder, "new.xmp", b"ours")
-    (folder / "new.xmp").write_bytes(b"edited by another program")
-    report = undo(folder)
-    assert (report.restored, report.changed_since) == (["old.xmp"], ["new.xmp"])
-    assert (folder / "new.xmp").read_bytes() == b"edited by another program"
-    (folder / "new.xmp").unlink()
-    assert undo(folder).changed_since == [], "the journal was kept"
-    assert not (folder / FOLDER).exists()
 
 
 def test_a_change_between_two_writes_is_not_lost_by_undo(folder: Path) -> None:
@@ -225,16 +212,6 @@ def test_an_undo_that_was_killed_is_finished_by_the_next(folder: Path) -> None:
     assert 5 < killed < MOMENTS - 1
 
 
-def test_an_incomplete_last_line_of_the_journal_stands_for_no_change(folder: Path) -> None:
-    before = contents(folder)
-    write(folder, "old.xmp", b"ours")
-    with (folder / FOLDER / JOURNAL).open("ab") as journal:
-        journal.write(b'{"path": "sub/b.jpg", "bef')
-    write(folder, "new.xmp", b"later")
-    undo(folder)
-    assert contents(folder) == before
-
-
 def test_files_are_copied_where_hard_links_are_not_possible(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -246,10 +223,3 @@ def test_files_are_copied_where_hard_links_are_not_possible(
     write(folder, "old.xmp", b"ours")
     undo(folder)
     assert contents(folder) == before
-
-
-def test_two_commands_do_not_write_at_the_same_time(folder: Path) -> None:
-    write(folder, "old.xmp", b"ours")
-    with FileLock(folder / FOLDER / "lock"), pytest.raises(Conflict, match="Another"):
-        undo(folder)
-    undo(folder)

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from shared.errors import Unprocessable
 from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.evidence import PhotoLocation, RankedPhoto
 from shared.evaluation.places.figures import PlaceEvaluation, evaluate_places
 from shared.evaluation.places.fit import (
-    MIN_LABELLED_QUERIES,
     MapScores,
     PlaceSample,
     fit_place_model,
@@ -30,6 +30,7 @@ from shared.evaluation.places.levels import (
 )
 from shared.evaluation.places.probability import (
     ELSEWHERE_SHARE,
+    MIN_LABELLED_QUERIES,
     Background,
     Elsewhere,
     MapExtent,
@@ -221,7 +222,7 @@ def test_an_answer_is_the_finest_level_over_the_threshold_if_the_query_is_in_the
     assert model.answer([0.91, 0.96], 0.04, 0.95) == 0
     assert model.answer([0.91, 0.92], 0.08, 0.95) is None
     assert model.answer([0.5, 0.91], 0.04, 0.95) == 1
-    assert model.answer([0.5, 0.89], 0.04, 0.95) is None
+    assert model.answer([0.5, 0.89], 0.04, 0.95) == 1  # the whole map
     without_thresholds = PlaceModel(source="own_photos")
     assert without_thresholds.answer([0.94, 0.96], 0.04, 0.95) == 1  # the certainty is one
     assert [model.is_in_map(missing) for missing in (0.05, 0.06, 0.5, 0.51)] == [
@@ -310,7 +311,7 @@ def test_the_more_similar_the_best_photo_and_the_clearer_its_place_the_less_is_i
             of_score(0.12)[0],
             features=np.append(np.zeros(len(FEATURES)), [support / 100, 0, 0, 0, 0]),
         )
-        for support in (5.0, 10.0, 60.0)
+        for support in (5.0, 10.0, 100.0)
     ]
     by_matches = [known.probability([level], 0.33) for level in matched]
     assert by_matches == sorted(by_matches, reverse=True)
@@ -510,11 +511,11 @@ def test_a_map_of_few_photos_keeps_the_prior_and_a_small_one_stays_near_it() -> 
 
     assert change(small) < change(large)
     sources = (small.source, small.calibration_source, large.calibration_source)
-    assert sources == ("own_photos", "prior", "own_photos")
+    assert sources == ("own_photos", "prior", "prior")
 
 
-def test_the_calibration_source_is_the_prior_below_two_hundred_own_photos() -> None:
-    for own_photos, expected in ((199, "prior"), (200, "own_photos")):
+def test_the_calibration_source_is_the_prior_below_two_thousand_own_photos() -> None:
+    for own_photos, expected in ((1999, "prior"), (2000, "own_photos")):
         model = PlaceModel(source="own_photos", own_photos=own_photos)
         assert model.calibration_source == expected
         assert model.is_fitted, "a small map answers with its own thresholds"
@@ -593,3 +594,34 @@ def test_matches_choose_the_place_but_only_if_the_map_is_fitted_for_them() -> No
         estimate = model.estimate(ranked, [], PATHS, 0.95, 25.0)
         assert estimate is not None
         assert (estimate.levels[0].place, estimate.location) == (expected.place, expected)
+
+
+def test_levels_learn_nothing_from_impostors_which_look_as_weak_as_a_query_at_night() -> None:
+    own = [sample for sample in own_samples() if sample.left_out is None]
+    assert len(own) < len(own_samples())
+    levels = [fit_place_model(s, [], PATHS, SCORES).model.levels for s in (own, own_samples())]
+    assert levels[0] == levels[1]
+
+
+@pytest.mark.parametrize(("error", "allowed"), [(0.05, 1), (0.1, 3)])
+def test_a_guarantee_counts_one_more_labelled_query_as_wrong(error: float, allowed: int) -> None:
+    wrong_until = [0.9 - n / 100 for n in range(40)]
+    threshold = PlaceModel(wrong_until=tuple(wrong_until)).threshold(0.95, error)
+    assert sum(each >= threshold for each in wrong_until) == allowed
+    assert (allowed + 1) / 41 <= error < (allowed + 2) / 41
+
+
+def test_a_guarantee_without_enough_labelled_queries_says_how_many_it_takes() -> None:
+    with pytest.raises(Unprocessable, match="takes 99 labelled queries") as refused:
+        PlaceModel(wrong_until=(0.0,) * 98).threshold(0.95, 0.01)
+    assert refused.value.code == "too_few_labelled_queries"
+    assert PlaceModel(wrong_until=(0.0,) * 99).threshold(0.95, 0.01) < 1e-9
+
+
+def test_queries_are_new_to_a_map_if_they_are_less_similar_than_those_of_its_calibration() -> None:
+    model = PlaceModel(own_photos=100, best_scores=tuple(np.linspace(0.1, 0.5, 101).tolist()))
+    rng = np.random.default_rng(0)
+    assert not model.is_new(rng.uniform(0.1, 0.5, 100).tolist())
+    assert not model.is_new(rng.uniform(0.3, 0.5, 100).tolist()), "more similar ones are not new"
+    assert model.is_new(rng.uniform(0.1, 0.2, 100).tolist())
+    assert not model.is_new([0.1] * 29), "too few to tell"

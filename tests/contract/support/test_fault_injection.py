@@ -10,8 +10,8 @@ import httpx2
 import pytest
 from redis import Redis
 
-from lab.benchmarks.fault_injection import FaultProxy, MessageDuplicator, ProxyMode
 from shared.jobs.wakeups import WakeupQueue
+from tests.support.fault_injection import FaultProxy, MessageDuplicator, ProxyMode
 from tests.support.servers import start_redis
 from tests.support.servers.daemon import free_ports
 

@@ -23,11 +23,11 @@ from urllib.parse import urlsplit
 import httpx2
 from sqlalchemy.engine import make_url
 
-from lab.benchmarks.fault_injection import FaultProxy
 from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
 from shared.storage import ObjectStore
 from shared.storage.s3 import S3Store
+from tests.support.fault_injection import FaultProxy
 from tests.support.processes import PLACEWISE, Process, start
 from tests.support.server import SERVICES_KEY, environment
 from tests.support.servers import (

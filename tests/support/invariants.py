@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from uuid import UUID
 
 from sqlalchemy import ColumnElement, func, select
@@ -21,27 +20,6 @@ from shared.storage import ObjectStore
 from shared.storage.chunks import manifest_key
 
 
-@dataclass(slots=True)
-class InvariantViolations:
-    """Numbers of violations of each invariant; all must be zero."""
-
-    lost: int = 0
-    """Acknowledged photos that the catalog or the store does not have, or that have no row."""
-    twice: int = 0
-    """Photos with more than one row in the active generation, or stored twice."""
-    stuck: int = 0
-    """Jobs that have not ended."""
-    failed: int = 0
-    """Jobs that ended with an error, although nothing is wrong with any photo."""
-    torn: int = 0
-    """Live chunks whose bytes or manifest are not what the catalog says."""
-    details: list[str] = field(default_factory=list)
-
-    @property
-    def none_found(self) -> bool:
-        return not (self.lost or self.twice or self.stuck or self.failed or self.torn)
-
-
 def count_unfinished_jobs(catalog: Catalog, *, photos: bool = False) -> int:
     """Count unfinished jobs; with `photos`, without the jobs of queries."""
     conditions: list[ColumnElement[bool]] = [Job.state.in_(UNFINISHED_STATES)]
@@ -51,11 +29,10 @@ def count_unfinished_jobs(catalog: Catalog, *, photos: bool = False) -> int:
         return session.scalar(select(func.count()).select_from(Job).where(*conditions)) or 0
 
 
-def check_invariants(
+def find_violations(
     catalog: Catalog, store: ObjectStore, acknowledged: Mapping[str, UUID]
-) -> InvariantViolations:
-    """Count violations; `acknowledged` maps the sha256 of each acknowledged photo to its id."""
-    counts = InvariantViolations()
+) -> list[str]:
+    """Return what is wrong; `acknowledged` maps the sha256 of each acknowledged photo to its id."""
     with catalog.read() as session:
         photos = {
             photo.id: photo
@@ -69,33 +46,25 @@ def check_invariants(
             )
         )
         chunks = session.scalars(select(Chunk).where(Chunk.superseded_at.is_(None))).all()
-        failed = session.scalars(select(Job).where(Job.state == JobState.FAILED)).all()
-    counts.stuck = count_unfinished_jobs(catalog)
-    counts.failed = len(failed)
-    counts.details += [f"the job {job.id} ({job.kind}) failed: {job.error}" for job in failed]
+        jobs = session.scalars(select(Job).where(Job.state != JobState.SUCCEEDED)).all()
     stored = {info.key for info in store.list("originals/")}
+    by_sha256 = Counter(photo.sha256 for photo in photos.values())
+    found = [f"the job {job.id} ({job.kind}) is {job.state}: {job.error}" for job in jobs]
     for sha256, photo_id in acknowledged.items():
         photo = photos.get(photo_id)
         if photo is None or photo.sha256 != sha256:
-            counts.details.append(f"acknowledged photo {photo_id} is not in the catalog")
+            found.append(f"acknowledged photo {photo_id} is not in the catalog")
         elif photo.object_key not in stored:
-            counts.details.append(f"acknowledged photo {photo_id} is not in the object store")
+            found.append(f"acknowledged photo {photo_id} is not in the object store")
         elif not rows[photo_id]:
-            counts.details.append(f"acknowledged photo {photo_id} has no descriptor")
-        else:
-            continue
-        counts.lost += 1
-    by_sha256 = Counter(photo.sha256 for photo in photos.values())
-    doubled = [f"{sha256} is stored {n} times" for sha256, n in by_sha256.items() if n > 1]
-    doubled += [f"{photo_id} has {n} rows" for photo_id, n in rows.items() if n > 1]
-    torn = [
+            found.append(f"acknowledged photo {photo_id} has no descriptor")
+    found += [f"{sha256} is stored {n} times" for sha256, n in by_sha256.items() if n > 1]
+    found += [f"{photo_id} has {n} rows" for photo_id, n in rows.items() if n > 1]
+    return found + [
         f"chunk {chunk.object_key} does not match its hash in the catalog"
         for chunk in chunks
         if not _is_intact(store, chunk)
     ]
-    counts.twice, counts.torn = len(doubled), len(torn)
-    counts.details += doubled + torn
-    return counts
 
 
 def _is_intact(store: ObjectStore, chunk: Chunk) -> bool:

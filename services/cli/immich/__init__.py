@@ -1,0 +1,1 @@
+"""`placewise immich`: the photos of an Immich server as a library."""

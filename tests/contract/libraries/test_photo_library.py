@@ -1,0 +1,240 @@
+"""What `locate` relies on, for each library: a folder, and Immich (a stand-in server)."""
+
+from __future__ import annotations
+
+import io
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+from filelock import FileLock
+from PIL import Image
+from PIL.ExifTags import IFD, Base
+
+from services.cli.immich import api
+from services.cli.immich.library import ImmichLibrary
+from services.cli.locate.library import LibraryPhoto, LocatedPhoto, PhotoLibrary
+from services.cli.locate.undo_journal import FOLDER
+from services.cli.locate.writers import FolderLibrary, Target
+from shared.errors import Conflict, NotFound, Unprocessable
+from shared.geotagging.fusion import Proposal
+from tests.support.immich_server import KEY, NOON, ImmichServer, running_immich
+from tests.support.photos import encoded, exif_with_position, photo_bytes, photo_image
+
+HERE, THERE = (45.0691, 7.6853), (45.08, 7.69)
+
+
+class Case(ABC):
+    """A library, and what its owner does to it beside Placewise."""
+
+    library: PhotoLibrary
+    journal: Path
+    lock: Path
+
+    @abstractmethod
+    def add(self, number: int, seconds: float, position: tuple[float, float] | None) -> str:
+        """Add a photo; returns its name."""
+
+    @abstractmethod
+    def place(self, name: str, position: tuple[float, float]) -> None:
+        """Give a photo coordinates, as another program would."""
+
+    @abstractmethod
+    def delete(self, name: str) -> None: ...
+
+
+class FolderCase(Case):
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder / "trip"
+        self.folder.mkdir()
+        self.journal = self.folder / FOLDER / "journal.jsonl"
+        self.lock = self.journal.with_name("lock")
+        self.library = FolderLibrary(self.folder, Target.EXIF)
+
+    def add(self, number: int, seconds: float, position: tuple[float, float] | None) -> str:
+        exif = exif_with_position(*position) if position else Image.Exif()
+        exif[Base.Make], exif[Base.Model] = "Maker", "X100"
+        clock = NOON + timedelta(hours=2, seconds=seconds)
+        exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = f"{clock:%Y:%m:%d %H:%M:%S}"
+        exif.get_ifd(IFD.Exif)[Base.OffsetTimeOriginal] = "+02:00"
+        data = encoded(photo_image(number), "JPEG", exif=exif)
+        (self.folder / f"IMG_{number}.jpg").write_bytes(data)
+        return f"IMG_{number}.jpg"
+
+    def place(self, name: str, position: tuple[float, float]) -> None:
+        exif = exif_with_position(*position)
+        (self.folder / name).write_bytes(encoded(photo_image(99), "JPEG", exif=exif))
+
+    def delete(self, name: str) -> None:
+        (self.folder / name).unlink()
+
+
+class ImmichCase(Case):
+    def __init__(self, folder: Path, immich: ImmichServer) -> None:
+        self.immich = immich
+        self.library = ImmichLibrary(api.ImmichApi(immich.url, KEY), folder / "journals")
+        self.journal = folder / "journals" / f"{self.library.identity.split(':')[1]}.jsonl"
+        self.lock = self.journal.with_suffix(".lock")
+
+    def add(self, number: int, seconds: float, position: tuple[float, float] | None) -> str:
+        name = f"IMG_{number}.jpg"
+        self.immich.add(name, photo_bytes(number), position, seconds)
+        return name
+
+    def place(self, name: str, position: tuple[float, float]) -> None:
+        self.immich.move(self._id(name), *position)
+
+    def delete(self, name: str) -> None:
+        self.immich.delete(self._id(name))
+
+    def _id(self, name: str) -> str:
+        return next(k for k, v in self.immich.assets.items() if v["originalFileName"] == name)
+
+
+@pytest.fixture(params=["folder", "immich"])
+def case(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Case]:
+    monkeypatch.setattr(api, "WRITE_INTERVAL_SECONDS", 0.0)
+    if request.param == "folder":
+        yield FolderCase(tmp_path)
+        return
+    with running_immich() as immich:
+        yield ImmichCase(tmp_path, immich)
+
+
+def listed(case: Case) -> dict[str, LibraryPhoto]:
+    return {photo.name: photo for photo in case.library.list_photos()}
+
+
+def proposed(photo: LibraryPhoto, position: tuple[float, float] = THERE) -> LocatedPhoto:
+    return LocatedPhoto(photo, Proposal(*position, 100.0, 0.99, 20.0, "a test"), None, None, None)
+
+
+def test_photos_have_time_camera_and_coordinates_as_far_as_they_are_known(case: Case) -> None:
+    known, unknown = case.add(1, 0, HERE), case.add(2, 20, None)
+    photos = listed(case)
+    assert (photos[known].latitude, photos[known].longitude) == pytest.approx(HERE, abs=1e-5)
+    assert not photos[known].is_unlocated
+    assert photos[unknown].is_unlocated
+    assert photos[unknown].time == NOON + timedelta(seconds=20)
+    assert photos[unknown].time_zone_is_known
+    assert photos[unknown].camera == photos[known].camera
+    assert len({photo.id for photo in photos.values()}) == 2
+
+
+def test_a_photo_keeps_id_and_state_until_its_picture_changes(case: Case) -> None:
+    name = case.add(1, 0, None)
+    before = listed(case)[name]
+    assert listed(case)[name] == before
+    case.delete(name)
+    case.add(7, 0, None)
+    assert name not in listed(case)
+
+
+def test_the_picture_of_a_photo_can_be_fetched_twice(case: Case) -> None:
+    name = case.add(3, 0, None)
+    photo = listed(case)[name]
+    for _ in range(2):
+        fetched = case.library.fetch(photo)
+        data = fetched.read_bytes() if isinstance(fetched, Path) else fetched.read()
+        with Image.open(io.BytesIO(data)) as image:
+            assert image.size == photo_image(3).size
+
+
+def test_accepted_positions_are_written_and_undone(case: Case) -> None:
+    names = [case.add(number, 0, None) for number in (1, 2, 3)]
+    case.add(4, 0, HERE)
+    before = listed(case)
+    report = case.library.write([proposed(before[name]) for name in names[:2]])
+    assert (len(report.written), report.skipped) == (2, {})
+    written = listed(case)
+    for name in names[:2]:
+        position = (written[name].latitude, written[name].longitude)
+        assert position == pytest.approx(THERE, abs=1e-6)
+    assert written[names[2]].is_unlocated
+    undone = case.library.undo()
+    assert len(undone.restored + undone.removed) == 2
+    assert undone.changed_since == []
+    assert {n: p.latitude for n, p in listed(case).items()} == {
+        n: p.latitude for n, p in before.items()
+    }
+    with pytest.raises(NotFound) as nothing:
+        case.library.undo()
+    assert nothing.value.code == "nothing_to_undo"
+
+
+def test_a_photo_that_got_coordinates_or_was_deleted_meanwhile_is_left_alone_and_named(
+    case: Case,
+) -> None:
+    placed, deleted, other = (case.add(number, 0, None) for number in (1, 2, 3))
+    photos = listed(case)
+    case.place(placed, HERE)
+    case.delete(deleted)
+    report = case.library.write([proposed(photos[name]) for name in (placed, deleted, other)])
+    assert len(report.written) == 1
+    assert report.skipped[placed] == "got coordinates meanwhile"
+    assert "deleted meanwhile" in report.skipped[deleted]
+    assert listed(case)[placed].latitude == pytest.approx(HERE[0], abs=1e-5)
+
+
+def test_undo_leaves_what_was_changed_since_alone_and_names_it(case: Case) -> None:
+    names = [case.add(number, 0, None) for number in (1, 2)]
+    photos = listed(case)
+    case.library.write([proposed(photos[name]) for name in names])
+    case.place(names[0], HERE)
+    undone = case.library.undo()
+    assert (undone.changed_since, len(undone.restored + undone.removed)) == ([names[0]], 1)
+    assert listed(case)[names[0]].latitude == pytest.approx(HERE[0], abs=1e-5)
+    assert listed(case)[names[1]].is_unlocated
+    assert case.library.undo().changed_since == [names[0]], "the journal stays"
+
+
+def test_undo_restores_the_state_before_several_writes(case: Case) -> None:
+    names = [case.add(number, 0, None) for number in (1, 2)]
+    photos = listed(case)
+    for name in names:
+        case.library.write([proposed(photos[name])])
+    case.library.undo()
+    assert all(listed(case)[name].is_unlocated for name in names)
+
+
+def test_a_place_without_coordinates_is_not_written(case: Case) -> None:
+    name = case.add(1, 0, None)
+    photo = listed(case)[name]
+    report = case.library.write([LocatedPhoto(photo, None, "tower/floor 7", 0.99, None)])
+    assert report.written == []
+    assert "has a place only" in report.skipped[photo.name]
+
+
+def test_an_incomplete_last_line_of_the_journal_stands_for_no_change(case: Case) -> None:
+    names = [case.add(number, 0, None) for number in (1, 2)]
+    photos = listed(case)
+    case.library.write([proposed(photos[names[0]])])
+    with case.journal.open("ab") as journal:
+        journal.write(b'{"path": "IM')
+    case.library.write([proposed(photos[names[1]])])
+    case.library.undo()
+    assert all(listed(case)[name].is_unlocated for name in names)
+
+
+def test_a_damaged_journal_is_refused_and_nothing_is_changed(case: Case) -> None:
+    name = case.add(1, 0, None)
+    case.library.write([proposed(listed(case)[name])])
+    case.journal.write_bytes(b"{}\n" + case.journal.read_bytes())
+    with pytest.raises(Unprocessable) as damaged:
+        case.library.undo()
+    assert damaged.value.code == "journal_damaged"
+    assert not listed(case)[name].is_unlocated
+
+
+def test_two_processes_never_write_into_one_library_at_once(case: Case) -> None:
+    names = [case.add(number, 0, None) for number in (1, 2)]
+    photos = listed(case)
+    case.library.write([proposed(photos[names[0]])])
+    with FileLock(case.lock), pytest.raises(Conflict) as refused:
+        case.library.write([proposed(photos[names[1]])])
+    assert refused.value.code == "locate_in_progress"
+    assert listed(case)[names[1]].is_unlocated
