@@ -156,12 +156,8 @@ class _SnapshotCollector(Collector):
             ("resident_bytes", "Bytes of descriptors in memory.", status.resident_bytes),
             ("mapped_bytes", "Bytes of descriptors on disk.", status.mapped_bytes),
             ("rows", "Searchable rows.", status.rows),
-            ("missing_chunks", "Unreadable chunks.", len(status.unreadable)),
-            (
-                "unwritten_chunks",
-                "Chunks that are still to be written to Milvus.",
-                len(status.missing) - len(status.unreadable),
-            ),
+            ("missing_chunks", "Unreadable chunks.", len(status.missing)),
+            ("unwritten_chunks", "Chunks still to be written to Milvus.", status.unwritten),
         ):
             yield GaugeMetricFamily(f"{METRIC_PREFIX}_{name}", text, value)
         scans = "First-level scans of the sign codes."

@@ -8,7 +8,7 @@ file in the system's page cache.
 from __future__ import annotations
 
 import threading
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from uuid import UUID
 
 
@@ -30,11 +30,6 @@ class MemoryBudget:
         """Release the memory of a generation."""
         with self._lock:
             self._requests.pop(generation_id, None)
-
-    def release_others(self, generation_ids: Collection[UUID]) -> None:
-        """Release the memory of all but these generations."""
-        with self._lock:
-            self._requests = {k: v for k, v in self._requests.items() if k in generation_ids}
 
 
 def allocate_parts(requests: Mapping[UUID, Sequence[int]], budget_bytes: int) -> dict[UUID, int]:

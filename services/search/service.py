@@ -137,7 +137,7 @@ def _check_readiness(worker: SearchWorker) -> Readiness:
                 f"last current {lag.seconds:.1f} s ago"
             )
     return Readiness(
-        status="not ready" if reasons else "degraded" if status.missing else "ready",
+        status="not ready" if reasons else "degraded" if status.incomplete else "ready",
         reasons=reasons,
         lags=status.lags,
         missing=list(status.missing),
@@ -184,7 +184,7 @@ class WorkerHeartbeat:
     def send_if_due(self) -> None:
         """Write the entry if the loaded versions have changed, or a heartbeat is due."""
         status = self._worker.status()
-        versions = status.loaded, status.unreadable
+        versions = status.loaded, status.missing
         if versions == self._sent_versions and time.monotonic() - self._sent_at < HEARTBEAT_SECONDS:
             return
         with self._catalog.write(is_heartbeat=versions == self._sent_versions) as session:
@@ -204,7 +204,7 @@ def serve_search(settings: Settings, announce: Announce) -> None:
         with listen(settings.host, settings.port) as listener:
             host, port = listener.getsockname()[:2]
             registry = CollectorRegistry()
-            worker = SearchWorker(catalog, store, settings)
+            worker = SearchWorker.from_settings(catalog, store, settings)
             url = reachable_url(host, port)
             heartbeat = WorkerHeartbeat(catalog, worker, f"{socket.gethostname()}:{port}", url)
             # Its clients are a few gateways, with one connection for each concurrent query.

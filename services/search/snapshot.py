@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from services.search.chunk_loader import LoadedChunk
 from services.search.photo_columns import JoinedColumns
 from shared.search_api.protocol import IndexPart, LoadedGeneration
-from shared.storage.chunks import Row
 
 if TYPE_CHECKING:  # imports numba, which takes a while to load; small maps need no codes
     from services.search.exact_rerank import RowBlocks
@@ -37,19 +36,6 @@ class Snapshot:
     """Whether some are missing only because the disk of the worker's cache is full."""
     parts: tuple[IndexPart, ...] = ()
     """Parts of the index, and whether they are resident or mapped files."""
-
-    @property
-    def unreadable(self) -> Collection[str]:
-        """Missing objects that can't be read."""
-        return self.missing
-
-    def read_row(self, object_key: str, row: int) -> Row | None:
-        """Return a row as (dimension,) float32; None if its chunk is not loaded.
-
-        Raises IndexError if the chunk has no such row.
-        """
-        chunk = self.by_key.get(object_key)
-        return None if chunk is None else chunk.rows[row].astype(np.float32)
 
     @cached_property
     def by_key(self) -> Mapping[str, LoadedChunk]:

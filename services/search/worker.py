@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Collection, Sequence
 from concurrent import futures
+from typing import Any
 from uuid import UUID
 
 import numpy as np
@@ -23,17 +24,21 @@ from services.search.catalog_sync import (
     SYNCED_STATES,
     ReplicationLagTracker,
     read_generation_versions,
+    sync_snapshot,
 )
-from services.search.memory_index import MemoryIndex
+from services.search.chunk_loader import list_generation_folders, remove_stale_folders
+from services.search.executor import SearchOptions, execute_query
+from services.search.photo_columns import build_row_mask
 from services.search.photo_matcher import PhotoMatcher
 from services.search.pose_estimator import PoseEstimator
 from services.search.query_batcher import QueryBatcher
-from services.search.row_index import IndexSnapshot, RowIndex
+from services.search.residency import MemoryBudget
+from services.search.snapshot import Snapshot
 from shared.catalog.database.errors import OutageLog
-from shared.catalog.database.session import IDLE_SECONDS, Catalog, ChangePoll
+from shared.catalog.database.session import Catalog, ChangePoll
 from shared.catalog.generations import GenerationState
 from shared.config.settings import Settings
-from shared.errors import Gone, NotFound, Unavailable
+from shared.errors import Gone, Misconfigured, NotFound, Unavailable
 from shared.search_api.background import subtract_background
 from shared.search_api.protocol import (
     MatchRequest,
@@ -65,25 +70,25 @@ class QueryRowReader:
             CACHED_ROW_BYTES, getsizeof=lambda row: row.nbytes
         )
 
-    def read_query(self, snapshot: IndexSnapshot, request: SearchRequest) -> Row:
+    def read_query(self, snapshot: Snapshot, request: SearchRequest) -> Row:
         """Return the (dimension,) row that a request refers to.
 
         Raises:
             Gone: `query_expired` if the row no longer exists.
             Unavailable: `chunk_unreadable` if the row's object is damaged.
         """
-        if request.object_key in snapshot.unreadable and not snapshot.disk_full:
+        chunk = snapshot.by_key.get(request.object_key)
+        if request.object_key in snapshot.missing and not snapshot.disk_full:
             raise _unreadable_error(request.object_key)
-        try:
-            row = snapshot.read_row(request.object_key, request.row)
-        except IndexError:
-            raise _reference_expired_error(f"row {request.row} of {request.object_key}") from None
-        if row is not None:
-            return row
-        reference = RowReference(object_key=request.object_key, row=request.row)
-        if request.object_key.startswith(QUERIES):  # expires with its object
-            return self._read(reference)
-        return self._read_cached(reference)
+        if chunk is None:
+            reference = RowReference(object_key=request.object_key, row=request.row)
+            if request.object_key.startswith(QUERIES):  # expires with its object
+                return self._read(reference)
+            return self._read_cached(reference)
+        if request.row >= len(chunk.rows):
+            raise _reference_expired_error(f"row {request.row} of {request.object_key}")
+        row: Row = chunk.rows[request.row].astype(np.float32)
+        return row
 
     def read_background(self, references: Sequence[RowReference]) -> list[Row]:
         """Return the rows of a background that still exist.
@@ -147,6 +152,7 @@ MAX_WAIT_SECONDS = 5.0  # for `min_version`; half of the time that the gateway g
 FOLLOW_SECONDS = 1.0  # interval of the polls for changes of the catalog
 VERSION_POLL_SECONDS = 0.01
 LOAD_THREADS = 4  # one may take minutes for a generation that is being built
+FILE_CHECK_SECONDS = 5.0  # interval of the checks whether mapped files were changed
 
 
 class SearchWorker:
@@ -170,24 +176,35 @@ class SearchWorker:
         self._catalog = catalog
         self._max_wait_seconds = max_wait_seconds
         self._store = store
+        self._folder = settings.search_cache_folder
         self.query_batcher = QueryBatcher()
-        self._unreadable = ReadRetries()
-        self._index: RowIndex
-        if settings.search_engine == "milvus":
-            from services.search.milvus.index import MilvusIndex  # needs the extra milvus
-
-            self._index = MilvusIndex(catalog, store, settings, self._unreadable)
-        else:
-            self._index = MemoryIndex(
-                catalog, store, settings, self._unreadable, self.query_batcher
-            )
+        self._memory_budget = MemoryBudget(settings.search_memory_bytes)
         self._query_rows = QueryRowReader(store)
         self._photo_matcher = PhotoMatcher(store)
         self._pose_estimator = PoseEstimator(store, self._photo_matcher)
-        self._snapshots: dict[UUID, IndexSnapshot] = {}
+        self._snapshots: dict[UUID, Snapshot] = {}
         self._lock = threading.Lock()  # of snapshots and loads; never held during I/O
-        self._loads: dict[UUID, futures.Future[IndexSnapshot | None]] = {}  # running
+        self._loads: dict[UUID, futures.Future[Snapshot | None]] = {}  # running, of each generation
         self._load_threads = futures.ThreadPoolExecutor(LOAD_THREADS, "search-load")
+        self._unreadable = ReadRetries()
+        self._files_due: dict[UUID, float] = {}  # next check of each generation's files
+
+    @classmethod
+    def from_settings(
+        cls, catalog: Catalog, store: ObjectStore, settings: Settings
+    ) -> SearchWorker:
+        """Create the worker of SEARCH_ENGINE."""
+        if settings.search_engine == "milvus":
+            try:
+                from services.search.milvus import MilvusWorker
+            except ImportError as error:
+                raise Misconfigured(
+                    "no_milvus",
+                    "SEARCH_ENGINE=milvus needs the extra milvus: pip install pymilvus.",
+                ) from error
+
+            return MilvusWorker(catalog, store, settings)
+        return cls(catalog, store, settings)
 
     def run(self, stop: threading.Event) -> None:
         """Sync active generations until `stop` is set."""
@@ -205,26 +222,21 @@ class SearchWorker:
     ) -> None:
         poll = ChangePoll(self._catalog)
         outage = OutageLog(f"search sync of {' and '.join(states)} generations")
-        failure = ""
         while not stop.is_set():
             try:
                 self.sync(states)
                 outage.record_success()
-                failure = ""
             except SQLAlchemyError as error:  # loaded snapshots go on serving queries
                 outage.record_error(error)
             except (OSError, Unavailable) as error:
-                if failure != str(error):
-                    log.error("sync failed, loaded snapshots go on serving queries: %s", error)
-                failure = str(error)
-            idle_seconds = FOLLOW_SECONDS if self._index.changes_alone else IDLE_SECONDS
-            poll.wait(stop, FOLLOW_SECONDS, idle_seconds)
+                log.error("sync failed, loaded snapshots go on serving queries: %s", error)
+            poll.wait(stop, FOLLOW_SECONDS)
 
     def sync(self, states: Collection[GenerationState] = SYNCED_STATES) -> None:
         """Sync every generation of these states to its map's version; drop deleted generations."""
         read_at = time.monotonic()
         # Before the catalog is read: what another thread loads meanwhile has not ended.
-        searched, held = self._snapshots.keys(), self._index.list_held()
+        held, stored = self._snapshots.keys(), self._list_stored()
         current = read_generation_versions(self._catalog)
         self.replication_lag.record_catalog_read(current, read_at)
         for generation_id, target in current.items():
@@ -234,15 +246,18 @@ class SearchWorker:
             if (
                 snapshot is None
                 or snapshot.version < target.version
-                or self._index.needs_sync(snapshot)
+                or self._needs_reload(snapshot)
             ):
                 self._load(generation_id, target.version)
             self.replication_lag.record_synced(generation_id, read_at)
-        ended = searched - current.keys()
+        ended = held - current.keys()
+        for generation_id in ended:
+            self._memory_budget.release_generation(generation_id)
         with self._lock:
             self._snapshots = {k: v for k, v in self._snapshots.items() if k not in ended}
             known = {*current, *self._snapshots, *self._loads}
-        self._index.remove_others(held, known)
+            self._files_due = {k: v for k, v in self._files_due.items() if k in known}
+        self._remove_stored(stored, known)
         self._unreadable.forget_others(
             {key for snapshot in self._snapshots.values() for key in snapshot.missing}
         )
@@ -254,7 +269,7 @@ class SearchWorker:
         if request.background:
             background = self._query_rows.read_background(request.background)
             query = subtract_background(query, background)
-        return self._index.search(snapshot, query, request)
+        return self._find_rows(snapshot, query, request)
 
     def match(self, request: MatchRequest) -> MatchResponse:
         """Match local features; see `MatchRequest`."""
@@ -277,13 +292,11 @@ class SearchWorker:
             versions=versions,
             incomplete=tuple(key for key, snapshot in snapshots.items() if snapshot.missing),
             missing=tuple(key for snapshot in snapshots.values() for key in snapshot.missing),
-            unreadable=tuple(key for each in snapshots.values() for key in each.unreadable),
             disk_full=any(snapshot.disk_full for snapshot in snapshots.values()),
             lags=self.replication_lag.current_lags(versions),
-            recalls=dict(self._index.recalls),
         )
 
-    def snapshot(self, generation_id: UUID, min_version: int) -> IndexSnapshot:
+    def snapshot(self, generation_id: UUID, min_version: int) -> Snapshot:
         """Return a snapshot at least as new as `min_version`.
 
         Raises:
@@ -299,7 +312,7 @@ class SearchWorker:
 
     def _load(
         self, generation_id: UUID, version: int, max_wait_seconds: float = threading.TIMEOUT_MAX
-    ) -> IndexSnapshot | None:
+    ) -> Snapshot | None:
         """Wait for a thread to load this version of a generation, or a later one.
 
         All who wait for a generation wait for the same thread. Returns None if the generation no
@@ -322,14 +335,52 @@ class SearchWorker:
             f"Search has not caught up with version {version} of the map. Retry in a moment.",
         )
 
-    def _load_snapshot(self, generation_id: UUID) -> IndexSnapshot | None:
+    def _load_snapshot(self, generation_id: UUID) -> Snapshot | None:
         """Load a generation in a thread of its own, and serve the new snapshot."""
         new = None
         try:
-            new = self._index.sync(generation_id, self._snapshots.get(generation_id))
+            new = self._sync_generation(generation_id, self._snapshots.get(generation_id))
             return new
         finally:
             with self._lock:
                 if new is not None:
                     self._snapshots = {**self._snapshots, generation_id: new}
                 del self._loads[generation_id]
+
+    # What follows depends on where the rows are; `MilvusWorker` has its own.
+
+    def _sync_generation(self, generation_id: UUID, old: Snapshot | None) -> Snapshot | None:
+        """Bring a snapshot up to date; None if the generation no longer exists."""
+        return sync_snapshot(
+            self._catalog,
+            self._store,
+            self._folder,
+            self._memory_budget,
+            generation_id,
+            old,
+            self._unreadable,
+        )
+
+    def _find_rows(self, snapshot: Snapshot, query: Row, request: SearchRequest) -> SearchResponse:
+        """Return the rows that are most similar to a query, (dimension,) float32."""
+        row_mask = build_row_mask(snapshot.photos, request.photos, request.exclude)
+        options = SearchOptions(request.k, request.mode)
+        return execute_query(snapshot, query, row_mask, options, self.query_batcher)
+
+    def _list_stored(self) -> list[Any]:
+        """List what is stored of any generation outside of this process."""
+        return list_generation_folders(self._folder)
+
+    def _remove_stored(self, stored: list[Any], known: Collection[UUID]) -> None:
+        """Remove what of this is of generations other than the known ones."""
+        remove_stale_folders(stored, known)
+
+    def _needs_reload(self, snapshot: Snapshot) -> bool:
+        """Whether a missing chunk is due for a retry, or a mapped file was changed."""
+        if self._unreadable.any_due(snapshot.missing):
+            return True
+        now = time.monotonic()
+        if now < self._files_due.get(snapshot.generation_id, 0.0):
+            return False
+        self._files_due[snapshot.generation_id] = now + FILE_CHECK_SECONDS
+        return any(chunk.was_changed() for chunk in snapshot.chunks)

@@ -44,13 +44,12 @@ class SearchSettings(BaseSettings):
     milvus_uri: SecretStr | None = Field(
         None,
         description="URL of Milvus, with a user or a token if it needs one: "
-        "https://user:password@milvus:19530, https://:token@milvus:19530; a file name that ends "
+        "https://user:password@milvus:19530, https://token@milvus:19530; a file name that ends "
         "in .db is opened with milvus-lite",
     )
-    milvus_index: Literal["FLAT", "HNSW", "IVF_FLAT"] = Field(
+    milvus_index: Literal["FLAT", "HNSW"] = Field(
         "FLAT",
-        description="index of new collections in Milvus: FLAT compares every row, the others are "
-        "approximate",
+        description="index of new collections in Milvus: FLAT compares all rows, HNSW only some",
     )
 
     # Search workers on several machines (`placewise search`, which listens on HOST and PORT).
@@ -100,16 +99,6 @@ class SearchSettings(BaseSettings):
                 "8192, which is possible before Milvus has them.",
                 dimension=dimension,
             )
-
-    @property
-    def search_engine_name(self) -> str:
-        """Where rows are, in words."""
-        return "Milvus" if self.search_engine == "milvus" else "memory"
-
-    @property
-    def milvus_address(self) -> str:
-        """MILVUS_URI as text, with what is secret in it."""
-        return self.milvus_uri.get_secret_value() if self.milvus_uri else ""
 
     @property
     def level_radii_m(self) -> tuple[float, ...]:

@@ -40,6 +40,7 @@ MAX_KEPT_CONNECTIONS = 64
 RETRY_PAUSE_SECONDS = 0.05  # before lagging workers are called again
 
 BEHIND = "search_behind"
+NO_ANSWER = "search_unavailable"
 
 
 class HttpSearchClient:
@@ -99,46 +100,45 @@ class HttpSearchClient:
         deadline = time.monotonic() + self._timeout_seconds
         behind: Unavailable | None = None
         while not self._stop.is_set():
-            retry = False
-            refused: Unavailable | None = None
             urls = self._workers.urls(request.generation_id, request.min_version)
-            for url, seconds in _attempts(urls, deadline):
-                try:
-                    return call_search(self._http, url, request, seconds)
-                except WorkerUnavailable as error:
-                    log.info("a call failed, trying the next worker: %s", error)
-                    self._workers.mark_down(url)
-                except Unavailable as error:
-                    log.debug("%s: %s", url, error.detail)
-                    if error.code == BEHIND:  # the worker may answer in a moment
-                        behind, retry = error, True
-                    else:
-                        refused = error
-            if refused is not None:
-                raise refused  # no other worker could answer
-            if not retry or time.monotonic() + RETRY_PAUSE_SECONDS > deadline:
-                # A worker that lagged and then timed out is reported as lagging.
-                raise behind or _no_answer()
+            try:
+                return self._call_any(urls, "search", request, SearchResponse, deadline)
+            except Unavailable as error:
+                if error.code == BEHIND:  # a worker may answer in a moment
+                    behind = error
+                elif error.code != NO_ANSWER or behind is None:
+                    raise
+            if time.monotonic() + RETRY_PAUSE_SECONDS > deadline:
+                raise behind
             time.sleep(RETRY_PAUSE_SECONDS)
-        raise Unavailable("search_unavailable", "The server is stopping. Retry in a moment.")
+        raise Unavailable(NO_ANSWER, "The server is stopping. Retry in a moment.")
 
     def match(self, request: MatchRequest) -> MatchResponse:
         """Match local features on one worker; on the next one when it fails."""
-        return self._call_any("match", request, MatchResponse)
+        deadline = time.monotonic() + self._timeout_seconds
+        return self._call_any(self._workers.urls(), "match", request, MatchResponse, deadline)
 
     def estimate_pose(self, request: PoseRequest) -> PoseResponse:
         """Compute a pose on one worker; on the next one when it fails."""
-        return self._call_any("pose", request, PoseResponse)
-
-    def _call_any(self, path: str, request: BaseModel, kind: type[Message]) -> Message:
         deadline = time.monotonic() + self._timeout_seconds
-        for url, seconds in _attempts(self._workers.urls(), deadline):
+        return self._call_any(self._workers.urls(), "pose", request, PoseResponse, deadline)
+
+    def _call_any(
+        self, urls: list[str], path: str, request: BaseModel, kind: type[Message], deadline: float
+    ) -> Message:
+        """Return the first answer; raises what a worker refused with, if none answers."""
+        refused = _no_answer()
+        for url, seconds in _attempts(urls, deadline):
             try:
-                return _post(self._http, f"{url}/{path}", request, kind, seconds)
+                return call_worker(self._http, f"{url}/{path}", request, kind, seconds)
             except WorkerUnavailable as error:
                 log.info("a %s request failed, trying the next worker: %s", path, error)
                 self._workers.mark_down(url)
-        raise _no_answer()
+            except Unavailable as error:
+                log.debug("%s: %s", url, error.detail)
+                if refused.code in (NO_ANSWER, BEHIND):
+                    refused = error
+        raise refused
 
     def status(self) -> SearchStatus:
         """Poll the workers and return the state of the most advanced one.
@@ -154,7 +154,7 @@ class HttpSearchClient:
 
 
 def _no_answer() -> Unavailable:
-    return Unavailable("search_unavailable", "No search worker answers. Retry in a moment.")
+    return Unavailable(NO_ANSWER, "No search worker answers. Retry in a moment.")
 
 
 def _attempts(urls: Sequence[str], deadline: float) -> Iterator[tuple[str, float]]:
@@ -173,25 +173,15 @@ CONNECT_SECONDS = 1.0  # workers are in the same network: a slower one counts as
 STATUS_TIMEOUT_SECONDS = 2.0  # a worker that answers more slowly gets no queries
 
 
-def call_search(
-    http: httpx2.Client, url: str, request: SearchRequest, timeout_seconds: float
-) -> SearchResponse:
-    """Call `POST /search` of one worker.
+def call_worker(
+    http: httpx2.Client, url: str, request: BaseModel, kind: type[Message], timeout_seconds: float
+) -> Message:
+    """Post a request to one worker.
 
     Raises:
         WorkerUnavailable: The worker could not be reached, or failed.
         PlacewiseError: As the worker answered it.
     """
-    return _post(http, f"{url}/search", request, SearchResponse, timeout_seconds)
-
-
-def _post(
-    http: httpx2.Client,
-    url: str,
-    request: BaseModel,
-    kind: type[Message],
-    timeout_seconds: float,
-) -> Message:
     body = _call(http, "POST", url, timeout_seconds, content=request.model_dump_json())
     return _read(kind, url, body)
 
@@ -199,7 +189,7 @@ def _post(
 def fetch_status(
     http: httpx2.Client, url: str, timeout_seconds: float = STATUS_TIMEOUT_SECONDS
 ) -> SearchStatus:
-    """Call `GET /status` of one worker; raises as `call_search` does."""
+    """Call `GET /status` of one worker; raises as `call_worker` does."""
     return _read(SearchStatus, url, _call(http, "GET", f"{url}/status", timeout_seconds))
 
 

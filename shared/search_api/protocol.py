@@ -144,11 +144,11 @@ class SearchStatus(_Message):
     held: dict[UUID, LoadedGeneration] = {}
     """Loaded generations."""
     incomplete: tuple[UUID, ...] = ()
-    """Generations with an unreadable chunk."""
+    """Generations with a chunk that can't be searched."""
     missing: tuple[str, ...]
-    """Object keys of chunks that are unreadable or not in the engine yet."""
-    unreadable: tuple[str, ...] = ()
-    """Those that are unreadable."""
+    """Object keys of unreadable chunks."""
+    unwritten: int = 0
+    """Chunks that are still to be written to Milvus."""
     disk_full: bool = False
     """Whether some are unreadable only because a worker's cache is on a full disk."""
     lags: dict[UUID, ReplicationLag] = {}

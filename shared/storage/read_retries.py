@@ -38,11 +38,6 @@ class ReadRetries:
             retry = self._retries.get(name)
             return retry is None or time.monotonic() >= retry.due_at
 
-    def has_failed(self, name: str) -> bool:
-        """Return whether the last read of the object failed."""
-        with self._lock:
-            return name in self._retries
-
     def any_due(self, names: Iterable[str]) -> bool:
         return any(self.is_due(name) for name in names)
 

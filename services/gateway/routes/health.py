@@ -154,8 +154,8 @@ def livez() -> ProbeResponse:
 def readyz(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> ProbeResponse:
     """Readiness probe: 503 while a component that every request needs is unavailable.
 
-    Degraded components are ready: the other chunks can be searched, and photos can be
-    deleted while the disk is full.
+    Degraded components are ready: the other chunks can be searched, and photos can be deleted while
+    the disk is full.
     """
     components = _check_components(gateway, admission)
     ready = all(component.status != "unhealthy" for component in components.values())
@@ -264,11 +264,13 @@ def _check_search(gateway: GatewayContext) -> ComponentStatus:
     except PlacewiseError as error:
         return ComponentStatus(status="unhealthy", detail=error.detail)
     problems = []
-    if status.unreadable:
-        named = ", ".join(status.unreadable[:MAX_NAMED_CHUNKS])
-        more = len(status.unreadable) - MAX_NAMED_CHUNKS
+    if status.unwritten:
+        problems.append(f"{status.unwritten} chunks are still to be written to Milvus")
+    if status.missing:
+        named = ", ".join(status.missing[:MAX_NAMED_CHUNKS])
+        more = len(status.missing) - MAX_NAMED_CHUNKS
         problems.append(
-            f"{len(status.unreadable)} chunks can't be read: {named}"
+            f"{len(status.missing)} chunks can't be read: {named}"
             + (f" and {more} more" if more > 0 else "")
             + (
                 " (the cache disk of a search worker is full: free space in its PLACEWISE_HOME; "
@@ -279,12 +281,11 @@ def _check_search(gateway: GatewayContext) -> ComponentStatus:
         )
     if problems:
         return ComponentStatus(status="degraded", detail="; ".join(problems))
-    detail = f"{status.rows} rows in {gateway.settings.search_engine_name}"
-    if filling := len(status.missing) - len(status.unreadable):
-        detail += f", {filling} chunks are still to be written"
+    place = "Milvus" if gateway.settings.search_engine == "milvus" else "memory"
+    detail = f"{status.rows} rows in {place}"
     if status.recalls:
-        detail += f", recall {min(status.recalls.values()):.3f} of recent answers"
-    return ComponentStatus(status="degraded" if filling else "healthy", detail=detail)
+        detail += f", recall of recent answers {min(status.recalls.values()):.3f}"
+    return ComponentStatus(status="healthy", detail=detail)
 
 
 def _check_messages(gateway: GatewayContext, depth: QueueDepth) -> QueueStatus:

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from services.search.milvus.collections import Milvus
+from services.search.milvus import MilvusWorker
 from tests.contract.search import test_milvus
-from tests.contract.search.test_milvus import milvus, on_milvus, port, worker
+from tests.contract.search.test_milvus import collections, on_milvus, port, worker
 from tests.support.servers.milvus import MilvusServer
 
-__all__ = ["milvus", "on_milvus", "port", "worker"]
+__all__ = ["on_milvus", "port", "worker"]
 pytestmark = pytest.mark.databases("sqlite")
 
 
@@ -21,10 +21,10 @@ def milvus_uri(milvus_server: MilvusServer) -> str:
 
 
 @pytest.fixture(autouse=True)
-def _no_collections(milvus: Milvus) -> Iterator[None]:
+def _no_collections(worker: MilvusWorker) -> Iterator[None]:
     yield
-    for name in milvus.names("placewise_"):
-        milvus.drop(name)
+    for name in collections(worker):
+        worker.client.drop_collection(name)
 
 
 class TestSearchOnAMilvusServer(test_milvus.TestSearchOnMilvus):

@@ -10,8 +10,8 @@ import pytest
 
 from shared.errors import Gone, NotFound, Unavailable
 from shared.ids import new_id
-from shared.search_api.client import call_search, fetch_status
-from shared.search_api.protocol import SearchRequest, SearchStatus
+from shared.search_api.client import call_worker, fetch_status
+from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
 from shared.search_api.workers import WorkerDirectory, WorkerUnavailable
 
 GENERATION = new_id()
@@ -115,7 +115,7 @@ def test_a_server_that_does_not_answer_as_a_search_worker_is_unreachable(
 ) -> None:
     fake.answers = {"http://a": answer}
     with pytest.raises(WorkerUnavailable, match="http://a"):
-        call_search(fake.http, "http://a", REQUEST, 1.0)
+        call_worker(fake.http, "http://a/search", REQUEST, SearchResponse, 1.0)
     with pytest.raises(WorkerUnavailable):
         fetch_status(fake.http, "http://a")
 
@@ -127,5 +127,5 @@ def test_what_a_worker_refuses_is_raised_as_the_error_that_it_was(
     problem = kind("some_code", "Some detail.", object_key="a").as_problem()
     fake.answers = {"http://a": httpx2.Response(kind.status, json=problem)}
     with pytest.raises(kind) as caught:
-        call_search(fake.http, "http://a", REQUEST, 1.0)
+        call_worker(fake.http, "http://a/search", REQUEST, SearchResponse, 1.0)
     assert (caught.value.code, caught.value.extra) == ("some_code", {"object_key": "a"})

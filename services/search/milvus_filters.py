@@ -61,8 +61,8 @@ def filter_expression(
         conditions.append(f'place == "{LABEL}{_hex(photo_filter.place)}"')
     if photo_filter.place_under is not None:
         level = LABEL + _hex(photo_filter.place_under)
-        first, end = level + _hex(PATH_SEPARATOR), level + _hex(chr(ord(PATH_SEPARATOR) + 1))
-        conditions.append(f'(place == "{level}" or (place >= "{first}" and place < "{end}"))')
+        below = f"{level}{_hex(PATH_SEPARATOR)}%"
+        conditions.append(f'(place == "{level}" or place like "{below}")')
     conditions += [f'array_contains(tags, "{_hex(tag)}")' for tag in photo_filter.tags]
     for part in photo_filter.tags_like:
         like = _texts(map(_hex, tags_with(part)))
