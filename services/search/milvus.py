@@ -386,22 +386,26 @@ class MilvusWorker(SearchWorker):
         # The newest first: a query may wait for a photo that was just published.
         waiting = sorted(chunks.keys() - written, key=lambda key: chunks[key].id, reverse=True)
         for key in waiting:
-            with self._catalog.read() as session:
-                values = list_live_filter_values(session, chunks[key].id)
-            photos = [(row, photo) for row, photo in values if photo.deleted_at is None]
-            there = set(self._get(name, [photo.photo_id.hex for _, photo in photos], "photo"))
-            lacking = [(row, photo) for row, photo in photos if photo.photo_id.hex not in there]
-            if not lacking or (
-                is_writer
-                and self._unreadable.is_due(key)
-                and self._write_photos(name, chunks[key], lacking)
-            ):
+            lacking = self._find_lacking(name, chunks[key])
+            may_write = is_writer and self._unreadable.is_due(key)
+            if lacking and may_write and self._write_photos(name, chunks[key], lacking):
+                # A collection that was just made does not always find what it has accepted.
+                lacking = self._find_lacking(name, chunks[key])
+            if not lacking:
                 new.add(key)
             if time.monotonic() >= ends_at:
                 break
         if len(new) < len(waiting):
             log.info("%s: %d of %d chunks are written", name, len(written) + len(new), len(chunks))
         return new
+
+    def _find_lacking(self, name: str, chunk: Chunk) -> list[tuple[int, PhotoFilterValues]]:
+        """Return the rows of a chunk, with their live photos, that are not in the collection."""
+        with self._catalog.read() as session:
+            values = list_live_filter_values(session, chunk.id)
+        photos = [(row, photo) for row, photo in values if photo.deleted_at is None]
+        there = set(self._get(name, [photo.photo_id.hex for _, photo in photos], "photo"))
+        return [(row, photo) for row, photo in photos if photo.photo_id.hex not in there]
 
     def _write_photos(
         self, name: str, chunk: Chunk, photos: Sequence[tuple[int, PhotoFilterValues]]
