@@ -215,10 +215,10 @@ class MilvusWorker(SearchWorker):
         if snapshot.unwritten or self._unreadable.any_due(snapshot.missing) or watch.wrong:
             return True
         try:
-            changed = self._read_mark(snapshot.collection) != snapshot.version
+            is_current = self._read_mark(snapshot.collection) == snapshot.version
         except MILVUS_ERRORS:  # perhaps it was dropped
             return True
-        return changed or time.monotonic() >= watch.check_at
+        return not is_current or time.monotonic() >= watch.check_at
 
     @engine_errors()
     def _sync_generation(self, generation_id: UUID, old: Snapshot | None) -> Snapshot | None:
@@ -312,17 +312,17 @@ class MilvusWorker(SearchWorker):
 
     def _create_collection(self, name: str, dimension: int, version: int) -> None:
         """Create a collection whose photos are to be written as of `version`."""
-        text = {"datatype": DataType.VARCHAR, "max_length": MAX_TEXT_BYTES}
+        text = {"max_length": MAX_TEXT_BYTES}
         schema = MilvusClient.create_schema(auto_id=False, enable_dynamic_field=False)
         schema.add_field("photo", DataType.VARCHAR, is_primary=True, max_length=40)
         schema.add_field("vector", DataType.FLOAT_VECTOR, dim=dimension)
         schema.add_field("findable", DataType.BOOL)
+        schema.add_field("captured_at", DataType.INT64)
         schema.add_field("latitude", DataType.DOUBLE)
         schema.add_field("longitude", DataType.DOUBLE)
-        schema.add_field("captured_at", DataType.INT64)
-        schema.add_field("place", **text)
-        tags = {**text, "datatype": DataType.ARRAY, "element_type": DataType.VARCHAR}
-        schema.add_field("tags", **tags, max_capacity=4096)
+        schema.add_field("place", DataType.VARCHAR, **text)
+        tags = {"element_type": DataType.VARCHAR, "max_capacity": 4096, **text}
+        schema.add_field("tags", DataType.ARRAY, **tags)
         index = MilvusClient.prepare_index_params()
         index.add_index("vector", self._index, metric_type="IP", params=INDEXES[self._index])
         options = {"consistency_level": "Strong", "timeout": WRITE_SECONDS}
@@ -576,24 +576,19 @@ class MilvusWorker(SearchWorker):
         exact = query.astype(np.float64)
         exact /= np.sqrt(exact @ exact)
 
-        def score(key: str) -> dict[UUID, float] | None:
+        def score(key: str) -> dict[UUID, float]:
             numbers, photos = zip(*located[key], strict=True)
             try:
                 rows = self._read_rows(key, numbers)
             except UNREADABLE as error:
                 log.warning("rows of %s can't be read: %s", key, error)
-                return None
+                return {}
             products = round_scores(np.vecdot(rows.astype(np.float64), exact))
             return dict(zip(photos, products.tolist(), strict=True))
 
-        scores: dict[UUID, float] = {}
-        unreadable = set()
-        for key, scored in zip(located, self._readers.map(score, located), strict=True):
-            if scored is None:
-                unreadable.add(key)
-            else:
-                scores |= scored
-        return scores, unreadable
+        scored = dict(zip(located, self._readers.map(score, located), strict=True))
+        scores = {photo_id: one for found in scored.values() for photo_id, one in found.items()}
+        return scores, {key for key, found in scored.items() if not found}
 
     def _read_rows(self, key: str, numbers: Sequence[int]) -> NDArray[np.float32]:
         """Read rows of a chunk, (n, dimension); raises one of UNREADABLE."""

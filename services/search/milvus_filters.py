@@ -19,7 +19,6 @@ from shared.search_api.photo_filter import Box, PhotoFilter
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 NO_TIME = -(10**18)  # before the first year that a datetime has
 NO_DEGREES = 1000.0
-NO_PLACE = ""
 FINDABLE = "findable == true"
 LABEL = "="
 """Begins a stored place, so that one without characters differs from none"""
@@ -33,7 +32,7 @@ def filter_columns(photo: PhotoFilterValues) -> dict[str, Any]:
         "latitude": NO_DEGREES if photo.latitude is None else photo.latitude,
         "longitude": NO_DEGREES if photo.longitude is None else photo.longitude,
         "captured_at": NO_TIME if photo.captured_at is None else _microseconds(photo.captured_at),
-        "place": NO_PLACE if photo.place is None else LABEL + _hex(photo.place),
+        "place": "" if photo.place is None else LABEL + _hex(photo.place),
         "tags": [_hex(tag) for tag in photo.tags],
     }
 
@@ -56,7 +55,7 @@ def filter_expression(
     if exclude:
         conditions.append(f"photo not in {_texts(id_.hex for id_ in exclude)}")
     if photo_filter.has_place:
-        conditions.append(f'(latitude < {NO_DEGREES} or place != "{NO_PLACE}")')
+        conditions.append(f'(latitude < {NO_DEGREES} or place != "")')
     if photo_filter.place is not None:
         conditions.append(f'place == "{LABEL}{_hex(photo_filter.place)}"')
     if photo_filter.place_under is not None:
@@ -81,14 +80,12 @@ def filter_expression(
 
 
 def _in_box(box: Box) -> str:
-    ranges = [_between("longitude", west, east) for west, east in box.longitude_ranges()]
-    poles = ["latitude == 90.0", "latitude == -90.0"]
-    longitude = " or ".join([*poles, *ranges])
-    return f"({_between('latitude', box.south, box.north)} and ({longitude}))"
-
-
-def _between(column: str, low: float, high: float) -> str:
-    return f"({column} >= {_number(low)} and {column} <= {_number(high)})"
+    latitude = f"latitude >= {_number(box.south)} and latitude <= {_number(box.north)}"
+    ranges = [
+        f"(longitude >= {_number(west)} and longitude <= {_number(east)})"
+        for west, east in box.longitude_ranges()
+    ]
+    return f"({latitude} and ({' or '.join(['latitude in [90.0, -90.0]', *ranges])}))"
 
 
 def _number(value: float) -> str:
