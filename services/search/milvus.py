@@ -329,8 +329,8 @@ class MilvusWorker(SearchWorker):
         self.client.create_collection(name, schema=schema, index_params=index, **options)
         self._write_mark(name, dimension, version)
 
-    def _read_mark(self, name: str, consistency: str = "Strong") -> int | None:
-        found = self._get(name, [MARK], "captured_at", consistency)
+    def _read_mark(self, name: str) -> int | None:
+        found = self._get(name, [MARK], "captured_at")
         return found[0] if found else None
 
     def _write_mark(self, name: str, dimension: int, version: int) -> None:
@@ -340,11 +340,9 @@ class MilvusWorker(SearchWorker):
         row = {**mark, "latitude": 0.0, "longitude": 0.0, "vector": vector}
         self.client.upsert(name, [row], timeout=WRITE_SECONDS)
 
-    def _get(
-        self, name: str, keys: Sequence[str], column: str, consistency: str = "Strong"
-    ) -> list[Any]:
+    def _get(self, name: str, keys: Sequence[str], column: str) -> list[Any]:
         """Return the column of those of these rows that are there."""
-        options = {"output_fields": [column], "consistency_level": consistency}
+        options = {"output_fields": [column], "consistency_level": "Strong"}
         get = partial(self.client.get, name, timeout=READ_SECONDS, **options)
         return [row[column] for some in _batches(keys, IDS_PER_CALL) for row in get(some)]
 
@@ -389,9 +387,8 @@ class MilvusWorker(SearchWorker):
             lacking = self._find_lacking(name, chunks[key])
             may_write = is_writer and self._unreadable.is_due(key)
             if lacking and may_write and self._write_photos(name, chunks[key], lacking):
-                # A collection that was just made does not always find what it has accepted.
-                lacking = self._find_lacking(name, chunks[key])
-            if not lacking:
+                lacking = []
+            if lacking == []:
                 new.add(key)
             if time.monotonic() >= ends_at:
                 break
@@ -399,9 +396,15 @@ class MilvusWorker(SearchWorker):
             log.info("%s: %d of %d chunks are written", name, len(written) + len(new), len(chunks))
         return new
 
-    def _find_lacking(self, name: str, chunk: Chunk) -> list[tuple[int, PhotoFilterValues]]:
-        """Return the rows of a chunk, with their live photos, that are not in the collection."""
+    def _find_lacking(self, name: str, chunk: Chunk) -> list[tuple[int, PhotoFilterValues]] | None:
+        """Return the rows of a chunk, with their live photos, that are not in the collection.
+
+        None if it was merged since the chunks were listed: its photos are in another one then.
+        """
+        is_live = sa.select(Chunk.id).where(Chunk.id == chunk.id, Chunk.superseded_at.is_(None))
         with self._catalog.read() as session:
+            if session.scalar(is_live) is None:
+                return None
             values = list_live_filter_values(session, chunk.id)
         photos = [(row, photo) for row, photo in values if photo.deleted_at is None]
         there = set(self._get(name, [photo.photo_id.hex for _, photo in photos], "photo"))
@@ -552,9 +555,6 @@ class MilvusWorker(SearchWorker):
             consistency_level="Session",
             timeout=READ_SECONDS,
         )
-        # A collection that is being dropped may answer with nothing, before it is not found.
-        if self._read_mark(name, "Session") is None:
-            raise MilvusException(NO_COLLECTION, f"the collection {name} is gone")
         return list(found)
 
     @staticmethod

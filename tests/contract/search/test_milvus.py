@@ -201,6 +201,26 @@ class TestSearchOnMilvus(SearchPortContract):
         worker.sync()
         assert collections(worker) == ["placewise_of_others_1_FLAT"]
 
+    def test_chunk_that_is_merged_while_it_is_looked_at_is_not_taken_for_written(
+        self, places: SmallMap, worker: MilvusWorker, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        for seed in range(3):
+            places.add(unit_rows(seed, 5))
+        write_chunks = worker._write_chunks
+
+        def merge_first(*args: Any) -> set[str]:
+            assert places.merge()
+            return write_chunks(*args)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(worker, "_write_chunks", merge_first)
+            worker.sync()
+        vector = unit_rows(9, 1)[0]
+        request = places.request(places.query(vector), k=20, min_version=0)
+        assert worker.search(request).certificate == "none"
+        complete(worker)
+        assert_answers(worker.search(request), places.brute_force(vector, 20))
+
     def test_two_workers_write_one_generation_together(
         self, places: SmallMap, catalog: Catalog, store: FolderStore, on_milvus: Settings
     ) -> None:
