@@ -383,9 +383,48 @@ class AsyncClient(AsyncTransport):
         """Update a photo's metadata: omitted fields are unchanged, None clears a field."""
         return answers.OnePhoto(**await self._call("PATCH", f"/uploads/{file_id}", json=fields))
 
-    async def delete_photo(self, file_id: Id) -> answers.Deleted:
-        """Delete a photo."""
-        return answers.Deleted(**await self._call("DELETE", f"/uploads/{file_id}"))
+    async def delete_photo(self, file_id: Id, *, permanently: bool = False) -> answers.Deleted:
+        """Delete a photo; unless `permanently`, it can be restored for REMOVED_PHOTO_DAYS.
+
+        `photos(removed=True)` are those that can be.
+        """
+        params = {"permanently": permanently}
+        return answers.Deleted(**await self._call("DELETE", f"/uploads/{file_id}", params=params))
+
+    async def restore_photo(self, file_id: Id) -> answers.OnePhoto:
+        """Restore a deleted photo."""
+        return answers.OnePhoto(**await self._call("POST", f"/uploads/{file_id}/restore"))
+
+    async def propose_places(self, /, **options: Any) -> AsyncIterator[answers.PlaceProposal]:
+        """Iterate over proposals for the map's photos without a place. Nothing is stored.
+
+        Args:
+            options: `track`, `radius_m`, `motion` and `together`, as for `propose_positions`.
+        """
+        cursor: str | None = None
+        while True:
+            params = drop_none(cursor=cursor)
+            page = await self._call("POST", "/places/proposals", params=params, json=options)
+            for each in page["proposals"]:
+                yield answers.PlaceProposal(**each)
+            cursor = page["next_cursor"]
+            if cursor is None:
+                return
+
+    async def give_places(self, photos: Sequence[Json]) -> answers.GivenPlaces:
+        """Give places to photos that have none; those that have one are skipped and named.
+
+        Args:
+            photos: At most 1,000: `file_id`, and `latitude` and `longitude`, or `place`; of a
+                proposal also `heading`, `probability` and `reason`.
+        """
+        body = {"photos": list(photos)}
+        return answers.GivenPlaces(**await self._call("POST", "/places", json=body))
+
+    async def undo_places(self, file_ids: Sequence[Id] | None = None) -> answers.UndonePlaces:
+        """Take back the places that were given to these photos; None: to all of the map."""
+        body = {"file_ids": None if file_ids is None else [str(each) for each in file_ids]}
+        return answers.UndonePlaces(**await self._call("POST", "/places/undo", json=body))
 
     async def fit_vocabulary(self, /, **options: int) -> answers.Started:
         """Start fitting a vocabulary on the map's photos.

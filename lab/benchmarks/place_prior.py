@@ -9,9 +9,10 @@ are, without and with matches,
 
 - the levels, on the map's own photos and on its queries of other days, which count as much: own
   photos do not show how weak the evidence of a right answer can be;
-- what photos of elsewhere score (`Elsewhere`). The intercept is raised by what the worst pair of
-  a map and a set needs with coefficients that were fitted without both, so that at most one in
-  twenty of its photos is said to be in the map.
+- what photos of elsewhere score (`Elsewhere`). At most one in twenty photos of a set may be said to
+  be in a map, also in the worst pair of both, with coefficients that were fitted without them. For
+  that, with matches all log-odds are taken nearer to even chances; without, the intercept is
+  raised, since nearer to even chances half of the photos of elsewhere in real rooms are doubtful.
 
 With `--missing-place`, the features are standardised and the log-odds of a missing place fitted, on
 generated cities (`placewise datasets synth CITY --no-train --seed 1 ...`). Each is sampled once
@@ -57,8 +58,10 @@ from shared.matching.matchers import MutualNearest
 
 OWN, QUERIES = "own photos", "queries"
 MATCHED_PHOTOS = 45  # of each set, and twice as many of a map's own
+MATCHED_FEATURES = 3  # of "elsewhere"; without matches there are two
 MIN_PHOTOS = 20  # of a set, to say what one in twenty of it is
-PASSING = log(0.05 / 0.95) - log(ELSEWHERE_SHARE / (1 - ELSEWHERE_SHARE))  # log-odds without prior
+EVEN = -log(ELSEWHERE_SHARE / (1 - ELSEWHERE_SHARE))  # log-odds without prior of even chances
+PASSING = EVEN + log(0.05 / 0.95)
 SQUARES_M = (400.0, 100.0, 25.0)
 MAP_WEIGHT = 300.0  # of a map's own photos and queries, and of all photos of elsewhere
 PRECISION = 2.0  # of each coefficient of a level
@@ -124,10 +127,10 @@ def _thinned(numbers: Sequence[int], most: int) -> Sequence[int]:
 def fit_elsewhere(maps: Sequence[tuple[str, Mapping[str, FloatArray]]]) -> Coefficients:
     """Fit the log-odds of "elsewhere" on the (n, F) features of the photos of each set, by map.
 
-    The intercept is raised by what the worst pair needs (see the module), which is printed.
+    They are moved by what the worst pair needs (see the module), which is printed.
     """
     intercept, *slopes = _fit_log_odds(each for _, each in maps)
-    worst = (0.0, "no pair")
+    worst = (PASSING, "no pair")
     for name, foreign, features in ((name, k, v) for name, each in maps for k, v in each.items()):
         if foreign == QUERIES or len(features) < MIN_PHOTOS:
             continue
@@ -139,9 +142,12 @@ def fit_elsewhere(maps: Sequence[tuple[str, Mapping[str, FloatArray]]]) -> Coeff
         log_odds = np.sort(held_out[0] + features @ np.array(held_out[1:]))
         # As in conformal prediction, one more photo, which passes, is counted.
         least = log_odds[max(0, (len(log_odds) + 1) // 20 - 1)]
-        worst = max(worst, (float(PASSING + 0.001 - least), f"{foreign} in {name}"))
-    console.print(f"{worst[1]}: the intercept is raised by {worst[0]:.3f}")
-    return _rounded([intercept + worst[0], *slopes])
+        worst = min(worst, (float(least - 0.001), f"{foreign} in {name}"))
+    console.print(f"{worst[1]}: one in twenty photos is below {worst[0]:.3f}")
+    if len(slopes) < MATCHED_FEATURES:
+        return _rounded([intercept + PASSING - worst[0], *slopes])
+    nearer = (PASSING - EVEN) / (worst[0] - EVEN)
+    return _rounded([EVEN + nearer * (intercept - EVEN), *(nearer * slope for slope in slopes)])
 
 
 def _fit_log_odds(maps: Iterable[Mapping[str, FloatArray]]) -> Coefficients:

@@ -224,8 +224,6 @@ def find_suspect_labels(
     evaluation: EvaluationSet,
     ranked: Indices,
     scores: NDArray[np.float32] | None = None,
-    *,
-    min_score: float | None = None,
 ) -> list[SuspectLabel]:
     """Find confident first matches that are not positives but lie just outside the set's rule.
 
@@ -234,9 +232,8 @@ def find_suspect_labels(
 
     Args:
         ranked: (queries, k) database indices, best first.
-        scores: (queries, k) scores, higher is better; None treats every first match as confident.
-        min_score: Minimum score of a confident match; None for the median score of the first
-            matches that are positives.
+        scores: (queries, k) scores, higher is better: a confident match has at least the median of
+            the first matches that are positives. None treats every first match as confident.
 
     Returns the suspects, most confident first. Raises InvalidRequest
     (`predictions_of_other_queries`).
@@ -255,8 +252,7 @@ def find_suspect_labels(
     correct = compute_hits(ranked[:, :1], evaluation.positives)[:, 0]
     confident = ~correct
     if scores is not None:
-        if min_score is None:
-            min_score = float(np.median(scores[correct, 0])) if correct.any() else -np.inf
+        min_score = float(np.median(scores[correct, 0])) if correct.any() else -np.inf
         confident &= scores[:, 0] >= min_score
     candidates = np.flatnonzero(confident).tolist()
     pairs = [(evaluation.queries[n], evaluation.database[first[n]]) for n in candidates]

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from shared.geodesy import EARTH_RADIUS_M
 from shared.tracks import photo_graph
 from shared.tracks.photo_graph import FloatArray, Indices, PhotoTable, unit_vectors
 
-CELL_M = 100.0
-MAX_GRID_REACH_M = 2000.0
-"""Farther away, the cells would be more than the photos"""
-_OFFSET, _AXIS = 1 << 19, 1 << 20
+ROUNDING = 2e-15
+"""Of the squared chord between two unit vectors"""
 
 
 class ArrayPhotoGraph:
-    """A photo graph over arrays, for evaluations; photos with coordinates lie in a grid of cells.
+    """A photo graph over arrays, for evaluations; photos with coordinates are in a k-d tree.
 
     Args:
         table: All photos of the map.
@@ -27,12 +26,8 @@ class ArrayPhotoGraph:
     def __init__(self, table: PhotoTable) -> None:
         self._table = table
         self._row_of = {photo: row for row, photo in enumerate(table.ids.tolist())}
-        cells = _cells(table)
-        located = np.flatnonzero(~np.isnan(table.latitudes))
-        keys = _cell_keys(cells[located])
-        order = np.argsort(keys, kind="stable")
-        self._located, self._keys = located[order], keys[order]
-        self._vectors = unit_vectors(table)
+        self._located = np.flatnonzero(~np.isnan(table.latitudes))
+        self._tree = cKDTree(unit_vectors(table)[self._located])
         self._by_place: dict[str, list[int]] = {}
         self._by_sequence: dict[str, list[int]] = {}
         for row in np.flatnonzero(np.isnan(table.latitudes)).tolist():
@@ -82,24 +77,10 @@ class ArrayPhotoGraph:
         return {place: len(self._by_place.get(place, ())) for place in places}
 
     def _within(self, points: PhotoTable, reach_m: float) -> Indices:
-        if not len(points) or not len(self._located):
-            return np.zeros(0, dtype=np.int64)
-        if reach_m > MAX_GRID_REACH_M:
-            return self._near_any(points, np.sort(self._located), reach_m)
-        steps = int(np.ceil(reach_m / CELL_M))
-        axis = np.arange(-steps, steps + 1)
-        shifts = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-        cells = np.unique(_cells(points), axis=0)
-        keys = np.unique(_cell_keys((cells[:, None] + shifts[None]).reshape(-1, 3)))
-        starts, ends = (np.searchsorted(self._keys, keys, side) for side in ("left", "right"))
-        rows = [self._located[a:b] for a, b in zip(starts, ends, strict=True) if b > a]
-        candidates = np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
-        return self._near_any(points, np.sort(candidates), reach_m)
-
-    def _near_any(self, points: PhotoTable, candidates: Indices, reach_m: float) -> Indices:
-        cosines = self._vectors[candidates] @ unit_vectors(points).T
-        limit = 1 - (reach_m / EARTH_RADIUS_M) ** 2 / 2 - 1e-15
-        found: Indices = candidates[cosines.max(axis=1, initial=-1.0) >= limit]
+        """Return the sorted rows of the photos within the reach of any of the points."""
+        chord = np.sqrt((reach_m / EARTH_RADIUS_M) ** 2 + ROUNDING)
+        around = self._tree.query_ball_point(unit_vectors(points), chord)
+        found: Indices = self._located[sorted(set(chain.from_iterable(around)))]
         return found
 
     def _same_label(self, rows: set[int]) -> set[int]:
@@ -118,15 +99,3 @@ class ArrayPhotoGraph:
                 )
                 found.update(self._by_sequence[name][first:last])
         return found
-
-
-def _cells(photos: PhotoTable) -> Indices:
-    """Return (n, 3) cells of CELL_M of photos with coordinates."""
-    cells = np.floor(np.nan_to_num(unit_vectors(photos)) * (EARTH_RADIUS_M / CELL_M))
-    return cells.astype(np.int64)
-
-
-def _cell_keys(cells: Indices) -> Indices:
-    shifted = cells + _OFFSET
-    keys: Indices = (shifted[:, 0] * _AXIS + shifted[:, 1]) * _AXIS + shifted[:, 2]
-    return keys

@@ -37,31 +37,23 @@ def load_matrix(path: Path, kinds: str, code: str, expected: str) -> NDArray[Any
     try:
         matrix: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise InvalidRequest(code, f"Can't read {path}: {error}.") from error
+        raise InvalidRequest(code, f"Can't read {path} as a .npy file: {error}.") from error
     if not isinstance(matrix, np.ndarray) or matrix.ndim != 2 or matrix.dtype.kind not in kinds:
-        raise InvalidRequest(code, f"{path} must contain {expected}.")
+        what = f"{matrix.dtype} {matrix.shape}" if isinstance(matrix, np.ndarray) else "an archive"
+        raise InvalidRequest(code, f"{path} holds {what}. It must contain {expected}.")
     return matrix
 
 
 def read_predictions(path: Path) -> Indices:
     """Read (queries, k) int64 database indices, best first, from an `.npy` file.
 
-    Raises InvalidRequest: `predictions_unreadable`, `predictions_empty`, or `bad_predictions` (not
-    a two-dimensional integer array, or a negative index).
+    Raises InvalidRequest: `bad_predictions` (also for a negative index), `predictions_empty`.
     """
-    try:
-        stored = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InvalidRequest(
-            "predictions_unreadable", f"Can't read {path} as predictions in .npy format: {error}."
-        ) from error
-    if not isinstance(stored, np.ndarray) or stored.ndim != 2 or stored.dtype.kind not in "iu":
-        what = f"{stored.dtype} {stored.shape}" if isinstance(stored, np.ndarray) else "an archive"
-        raise InvalidRequest(
-            "bad_predictions",
-            f"{path} holds {what}. Predictions must be an integer array (queries, k): for each "
-            "query, the indices of the database photos, best first.",
-        )
+    expected = (
+        "an integer array (queries, k): for each query, the indices of the database photos, best "
+        "first"
+    )
+    stored = load_matrix(path, "iu", "bad_predictions", expected)
     if 0 in stored.shape:
         raise InvalidRequest(
             "predictions_empty",

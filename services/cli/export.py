@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import tarfile
 import tempfile
 from collections import Counter
+from collections.abc import Callable, Iterator
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, BinaryIO
 from uuid import UUID
 
 import numpy as np
 import typer
+from rich.progress import Progress
 
 from placewise.answers import Photo
 from placewise.client import Client
@@ -87,23 +91,13 @@ def descriptors(
     """
     with connect(server, map_name, key) as client, progress_bar() as progress:
         generation = generation or _active_generation_id(client)
-        receiving = progress.add_task("receiving (bytes)", total=None)
-        with refuse_unwritable(out):
-            out.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=out) as received:
-                client.export_descriptors(
-                    generation,
-                    received,
-                    lambda size: progress.update(receiving, completed=size),
-                    features=features,
-                )
-                received.seek(0)
-                with tarfile.open(fileobj=received, mode="r:") as tar:
-                    for name in (*EXPORTED_FILES, *([FEATURES_FILE] if features else [])):
-                        member = tar.extractfile(name)
-                        assert member is not None, "the archive contains regular files"
-                        with member, atomic_write(out / name) as file:
-                            shutil.copyfileobj(member, file)
+        receive = partial(client.export_descriptors, generation, features=features)
+        with _received_tar(out, receive, progress) as tar:
+            for name in (*EXPORTED_FILES, *([FEATURES_FILE] if features else [])):
+                member = tar.extractfile(name)
+                assert member is not None, "the archive contains regular files"
+                with member, atomic_write(out / name) as file:
+                    shutil.copyfileobj(member, file)
     rows, dimension = np.load(out / "descriptors.npy", mmap_mode="r").shape
     path = printable_path(out / "descriptors.npy")
     print_result(
@@ -111,6 +105,25 @@ def descriptors(
         as_json,
         f"{path}: {rows} rows of {dimension} dimensions.",
     )
+
+
+@contextlib.contextmanager
+def _received_tar(
+    out: Path, receive: Callable[[BinaryIO, Callable[[int], object]], None], progress: Progress
+) -> Iterator[tarfile.TarFile]:
+    """Receive an archive into a temporary file in the folder `out`, which is created, and open it.
+
+    Raises:
+        Misconfigured: `out_unwritable`.
+    """
+    receiving = progress.add_task("receiving (bytes)", total=None)
+    with refuse_unwritable(out):
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out) as received:
+            receive(received, lambda size: progress.update(receiving, completed=size))
+            received.seek(0)
+            with tarfile.open(fileobj=received, mode="r:") as tar:
+                yield tar
 
 
 def _active_generation_id(client: Client) -> UUID:
@@ -142,18 +155,9 @@ def colmap(
     """
     with connect(server, map_name, key) as client, progress_bar() as progress:
         made = client.reconstruction()
-        receiving = progress.add_task("receiving (bytes)", total=None)
-        with refuse_unwritable(out):
-            out.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=out) as received:
-                client.export_colmap(
-                    made.reconstruction_id,
-                    received,
-                    lambda size: progress.update(receiving, completed=size),
-                )
-                received.seek(0)
-                with tarfile.open(fileobj=received, mode="r:") as tar:
-                    tar.extractall(out, filter="data")
+        receive = partial(client.export_colmap, made.reconstruction_id)
+        with _received_tar(out, receive, progress) as tar:
+            tar.extractall(out, filter="data")
     photos = sum(component.photos for component in made.components)
     folder = printable_path(out)
     print_result(
@@ -257,36 +261,20 @@ def geojson(
     ):
         stats = client.stats()
         total = stats.total_images + stats.labelled_queries
-        features = _FeatureWriter(file)
+        file.write(b'{"type": "FeatureCollection", "features": [')
         for photo in progress.track(client.photos(), total=total, description="photos"):
-            properties = photo.model_dump(mode="json", include=PHOTO_PROPERTIES)
-            features.add(photo, properties)
+            feature = json.dumps(_to_feature(photo), ensure_ascii=False)
+            file.write((b",\n" if photos else b"\n") + feature.encode())
             photos += 1
-        features.end()
+        file.write(b"\n]}\n")
     print_result({"file": str(out), "photos": photos}, as_json, f"{out}: {photos} photos.")
 
 
-class _FeatureWriter:
-    """Streams GeoJSON features to a file, one per line."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self._separator = b"\n"
-        file.write(b'{"type": "FeatureCollection", "features": [')
-
-    def add(self, photo: Photo, properties: Json) -> None:
-        geometry: dict[str, Any] | None = None
-        if photo.latitude is not None:
-            coordinates = [photo.longitude, photo.latitude]
-            geometry = {"type": "Point", "coordinates": coordinates}
-        feature = {
-            "type": "Feature",
-            "id": str(photo.image_id),
-            "geometry": geometry,
-            "properties": properties,
-        }
-        self._file.write(self._separator + json.dumps(feature, ensure_ascii=False).encode())
-        self._separator = b",\n"
-
-    def end(self) -> None:
-        self._file.write(b"\n]}\n")
+def _to_feature(photo: Photo) -> Json:
+    point = {"type": "Point", "coordinates": [photo.longitude, photo.latitude]}
+    return {
+        "type": "Feature",
+        "id": str(photo.image_id),
+        "geometry": None if photo.latitude is None else point,
+        "properties": photo.model_dump(mode="json", include=PHOTO_PROPERTIES),
+    }

@@ -12,11 +12,11 @@ import logging
 import multiprocessing
 import os
 import pickle
+import signal
 import tempfile
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable
-from concurrent.futures import TimeoutError as TimedOut
 from concurrent.futures import wait
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from pebble import ProcessExpired, ProcessFuture, ProcessPool
 
-from services.extractor.decoder_process import decode_into_memory, limit_memory
+from services.extractor.decoder_process import StoredPhoto, decode_into_memory, prepare_process
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, Unavailable, Unprocessable
 from shared.ids import new_id
@@ -47,12 +47,13 @@ DECODE_MEMORY_BYTES = 2_000_000_000  # of one process: a JPEG of 200 megapixels 
 MAX_DECODE_ATTEMPTS = 2
 
 Decode = Callable[[bytes], DecodedPhoto]
+Photo = bytes | StoredPhoto
 
 
 class _Decoding:
     """A photo that is being decoded, and the memory to which its pixels are written."""
 
-    def __init__(self, pool: ProcessPool, data: bytes, decode: Decode, timeout: float) -> None:
+    def __init__(self, pool: ProcessPool, data: Photo, decode: Decode, seconds: float) -> None:
         name = f"photo-{new_id()}"
         self._path: str | None = None
         if hasattr(os, "memfd_create"):
@@ -63,7 +64,7 @@ class _Decoding:
             path = self._path
         try:
             self.future: ProcessFuture[tuple[bytes, list[int]]] = pool.schedule(
-                decode_into_memory, args=[decode, data, path, name], timeout=timeout
+                decode_into_memory, args=[decode, data, seconds, path, name]
             )
         except RuntimeError as error:  # raised by pebble when the pool is not running
             self.close()
@@ -100,7 +101,7 @@ class DecoderPool:
 
     def decode(
         self,
-        photos: Iterable[bytes],
+        photos: Iterable[Photo],
         preprocessing: Preprocessing,
         *,
         previews: Previews = Previews.NONE,
@@ -110,6 +111,10 @@ class DecoderPool:
 
         At most SCHEDULED_PER_PROCESS photos per process are taken from `photos` before the first
         of them is decoded: a generator that reads files holds as many in memory.
+
+        Raises:
+            Unavailable: The object store, or `decoders_broke`.
+            OSError: As the object store raises it.
         """
         with self._restart_lock:  # batches and model changes decode from different threads
             if not self._pool.active:
@@ -124,7 +129,7 @@ class DecoderPool:
             for_detection=for_detection,
         )
         outcomes: list[DecodedPhoto | PlacewiseError] = []
-        pending: deque[tuple[_Decoding, bytes]] = deque()
+        pending: deque[tuple[_Decoding, Photo]] = deque()
         try:
             for data in photos:
                 if len(pending) == self._settings.decode_processes * SCHEDULED_PER_PROCESS:
@@ -143,21 +148,22 @@ class DecoderPool:
         self._pool.join()
 
     def _start_pool(self) -> ProcessPool:
+        is_remote = self._settings.s3_endpoint is not None
         pool = ProcessPool(
             max_workers=self._settings.decode_processes,
             # Forking is not safe in a process with torch's threads and locks.
             context=multiprocessing.get_context("spawn"),
-            initializer=limit_memory,
-            initargs=[self._memory_bytes],
+            initializer=prepare_process,
+            initargs=[self._memory_bytes, "shared.storage.s3" if is_remote else "shared.storage"],
         )
         pool.schedule(os.getpid)  # starts the processes; else the first photo would
         return pool
 
-    def _schedule(self, data: bytes, decode: Decode) -> _Decoding:
+    def _schedule(self, data: Photo, decode: Decode) -> _Decoding:
         return _Decoding(self._pool, data, decode, self._timeout_seconds)
 
     def _result(
-        self, decoding: _Decoding, data: bytes, decode: Decode
+        self, decoding: _Decoding, data: Photo, decode: Decode
     ) -> DecodedPhoto | PlacewiseError:
         for attempt in range(1, MAX_DECODE_ATTEMPTS + 1):
             try:
@@ -166,12 +172,12 @@ class DecoderPool:
                 if isinstance(error, Unavailable):
                     raise
                 return error
-            except TimedOut:
-                return Unprocessable(
-                    "undecodable_photo",
-                    f"The photo could not be decoded within {self._timeout_seconds:g} s.",
-                )
             except (ProcessExpired, MemoryError) as error:
+                if isinstance(error, ProcessExpired) and error.exitcode == -signal.SIGALRM:
+                    return Unprocessable(
+                        "undecodable_photo",
+                        f"The photo could not be decoded within {self._timeout_seconds:g} s.",
+                    )
                 if attempt == MAX_DECODE_ATTEMPTS:
                     return Unprocessable(
                         "undecodable_photo",

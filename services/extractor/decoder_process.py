@@ -6,32 +6,62 @@ reader would hold the worker's interpreter meanwhile.
 
 from __future__ import annotations
 
+import functools
+import importlib
 import pickle
 import resource
+import signal
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from PIL import Image
 
+if TYPE_CHECKING:
+    from shared.imaging.decode import DecodedPhoto
+
+_open_store = functools.lru_cache(maxsize=2)(pickle.loads)  # its connections stay open
 # Memory blocks, 16 MiB at most each, that Pillow keeps for reuse between photos.
 PILLOW_CACHED_BLOCKS = 8
 
 
-def limit_memory(limit_bytes: int) -> None:
-    """Limit this process's address space, so that a photo that needs more can't be decoded."""
-    resource.setrlimit(resource.RLIMIT_AS, (limit_bytes, limit_bytes))
+@dataclass(frozen=True, slots=True)
+class StoredPhoto:
+    """A photo that its decoder reads from the object store, and where it stores the previews."""
+
+    store: bytes
+    """The pickled object store."""
+    key: str
+    thumbnail_key: str | None = None
+    preview_key: str | None = None
+
+
+def prepare_process(memory_bytes: int, store_module: str) -> None:
+    """Limit this process's address space, and import the store that the first photo needs.
+
+    A photo that needs more memory can't be decoded.
+    """
+    resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
     # Without reuse, every image's memory is mapped page by page and returned to the system, which
     # took almost half of the decoding time.
     Image.core.set_blocks_max(PILLOW_CACHED_BLOCKS)  # type: ignore[attr-defined]
+    importlib.import_module(store_module)
 
 
 def decode_into_memory(
-    decode: Callable[[bytes], object], data: bytes, path: str, name: str
+    decode: Callable[[bytes], DecodedPhoto],
+    photo: bytes | StoredPhoto,
+    seconds: float,
+    path: str,
+    name: str,
 ) -> tuple[bytes, list[int]]:
     """Write the arrays of the decoded photo to a file in memory.
 
     Args:
-        decode: Decodes the photo `data`.
+        decode: Decodes a photo.
+        photo: The photo. Of a stored one, thumbnail and preview are stored and not returned.
+        seconds: Time limit of `decode`, after which SIGALRM ends this process.
         path: Path of the file.
         name: Name of the file: the path may be that of another file, if the parent waits no longer.
 
@@ -40,9 +70,18 @@ def decode_into_memory(
 
     Raises:
         FileNotFoundError: The parent waits no longer.
+        PlacewiseError: As `decode` or the object store raises it.
     """
+    data = photo if isinstance(photo, bytes) else _open_store(photo.store).get(photo.key)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        decoded = decode(data)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+    if isinstance(photo, StoredPhoto):
+        decoded = _store_previews(photo, decoded)
     buffers: list[pickle.PickleBuffer] = []
-    photo = pickle.dumps(decode(data), protocol=5, buffer_callback=buffers.append)
+    pickled = pickle.dumps(decoded, protocol=5, buffer_callback=buffers.append)
     with Path(path).open("r+b", buffering=0) as file:
         opened = Path(f"/proc/self/fd/{file.fileno()}")  # of Linux alone
         if opened.is_symlink() and name not in str(opened.readlink()):
@@ -50,4 +89,13 @@ def decode_into_memory(
         arrays = [buffer.raw() for buffer in buffers]
         for array in arrays:
             file.write(array)
-    return photo, [array.nbytes for array in arrays]
+    return pickled, [array.nbytes for array in arrays]
+
+
+def _store_previews(photo: StoredPhoto, decoded: DecodedPhoto) -> DecodedPhoto:
+    store = _open_store(photo.store)
+    if photo.thumbnail_key is not None:
+        store.put(photo.thumbnail_key, decoded.thumbnail)
+    if photo.preview_key is not None and decoded.preview is not None:
+        store.put(photo.preview_key, decoded.preview)
+    return replace(decoded, thumbnail=b"", preview=None)

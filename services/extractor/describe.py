@@ -8,9 +8,8 @@ same precision, they are copied. Local features that the active generation has a
 from __future__ import annotations
 
 import logging
-from collections import deque
+import pickle
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any
 from uuid import UUID
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import select
 
+from services.extractor.decoder_process import StoredPhoto
 from services.extractor.generation_resolver import (
     ResolvedGeneration,
     requeue_until_vocabulary,
@@ -43,7 +43,6 @@ from shared.storage.keys import preview_key, query_key, query_preview_key, thumb
 
 log = logging.getLogger(__name__)
 
-READ_AHEAD = 4  # photos that are being read while others are decoded
 PREVIEWS_BY_KIND = {JobKind.INDEX: Previews.ALL, JobKind.DESCRIBE: Previews.OTHER_FORMATS}
 
 
@@ -65,9 +64,6 @@ def describe_photos(context: ExtractorContext, batch: JobBatch) -> Iterator[None
         with batch.timed("features"):
             features.detect()
     yield
-    with batch.timed("thumbnails"):
-        for stored in photos.previews:
-            stored.result()
     with batch.timed("publish"):
         publish(context, batch, target.generation, photos.ready, photos.failed, rows, features)
 
@@ -83,8 +79,6 @@ class _PreparedPhotos:
     """The pixels, or else a stored row, of each of the jobs in `ready`."""
     failed: list[tuple[Job, PlacewiseError]] = field(default_factory=list)
     """Jobs whose photo can't be described, each with the reason."""
-    previews: list[Future[None]] = field(default_factory=list)
-    """Thumbnails and previews that are being stored."""
 
     def compute_rows(self, dimension: int) -> Rows:
         """Compute a row for each job of `ready`.
@@ -129,7 +123,6 @@ def _read_photos(
     for job, photo in decoded:
         photos.ready.append(job)
         photos.inputs.append(photo.pixels)
-        photos.previews.append(context.transfers.submit(_store_previews, context.store, job, photo))
         if features:
             features.add_photo(job, photo)
     return photos
@@ -149,50 +142,33 @@ def _decode_photos(
     """
     with batch.timed("read"):
         keys = _photo_object_keys(context.catalog, batch.jobs)
-    present: list[Job] = []
-    decoded: list[tuple[Job, DecodedPhoto]] = []
-    failed: list[tuple[Job, PlacewiseError]] = []
-
-    def read() -> Iterator[bytes]:
-        # Read as they are decoded: a batch of the largest photos would take gigabytes.
-        waiting = deque(job for job in jobs if job.id in keys)
-        reads: deque[tuple[Job, Future[bytes]]] = deque()
-        while waiting or reads:
-            while waiting and len(reads) < READ_AHEAD:
-                job = waiting.popleft()
-                reads.append((job, context.transfers.submit(context.store.get, keys[job.id])))
-            job, reading = reads.popleft()
-            try:
-                with batch.timed("read"):
-                    data = reading.result()
-            except NotFound as error:
-                # Deleted since the catalog was read, or lost: `publish` checks under the map's
-                # lock.
-                failed.append((job, error))
-                continue
-            present.append(job)
-            yield data
-
-    previews = PREVIEWS_BY_KIND.get(batch.kind, Previews.NONE)
+    present = [job for job in jobs if job.id in keys]
+    store = pickle.dumps(context.store)
     with batch.timed("decode"):
         outcomes = context.decoders.decode(
-            read(), target.extractor.preprocessing, previews=previews, for_detection=for_detection
+            [StoredPhoto(store, keys[job.id], *_preview_keys(job)) for job in present],
+            target.extractor.preprocessing,
+            previews=PREVIEWS_BY_KIND.get(batch.kind, Previews.NONE),
+            for_detection=for_detection,
         )
+    decoded: list[tuple[Job, DecodedPhoto]] = []
+    failed: list[tuple[Job, PlacewiseError]] = []
     for job, outcome in zip(present, outcomes, strict=True):
         if isinstance(outcome, PlacewiseError):
+            # Also a photo that was deleted meanwhile: `publish` checks under the map's lock.
             failed.append((job, outcome))
         else:
             decoded.append((job, outcome))
     return decoded, failed
 
 
-def _store_previews(store: ObjectStore, job: Job, decoded: DecodedPhoto) -> None:
+def _preview_keys(job: Job) -> tuple[str | None, str | None]:
+    """Return the keys of a new photo's thumbnail and preview."""
+    if job.kind == JobKind.DESCRIBE:
+        return None, query_preview_key(job.id)
     if job.kind == JobKind.INDEX:
-        store.put(thumbnail_key(photo_id_of(job)), decoded.thumbnail)
-    if decoded.preview is not None:
-        is_query = job.kind == JobKind.DESCRIBE
-        key = query_preview_key(job.id) if is_query else preview_key(photo_id_of(job))
-        store.put(key, decoded.preview)
+        return thumbnail_key(photo_id_of(job)), preview_key(photo_id_of(job))
+    return None, None
 
 
 def _photo_object_keys(catalog: Catalog, jobs: list[Job]) -> dict[UUID, str]:

@@ -10,7 +10,6 @@ import contextlib
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 from services.extractor.decoder_pool import DecoderPool
@@ -20,8 +19,6 @@ from shared.catalog.jobs import Job, JobKind
 from shared.config.settings import Settings
 from shared.jobs.runner import ClaimedJobs
 from shared.storage import ObjectStore
-
-TRANSFER_THREADS = 8  # an object of a bucket takes milliseconds, a photo in the GPU one or two
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,15 +32,6 @@ class ExtractorContext:
     decoders: DecoderPool
     is_stopping: Callable[[], bool]
     """Whether the worker is to stop, so that a pass of a network of others is ended."""
-    transfers: ThreadPoolExecutor = field(
-        default_factory=lambda: ThreadPoolExecutor(TRANSFER_THREADS, "transfer")
-    )
-    """Threads that read photos ahead and store their previews."""
-
-    def close(self) -> None:
-        """End the decoders and threads."""
-        self.decoders.close()
-        self.transfers.shutdown()
 
 
 @dataclass(slots=True)

@@ -18,6 +18,8 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -53,13 +55,16 @@ log = logging.getLogger(__name__)
 
 DONE = object()  # a handler that has ended
 QUERY_POLL_SECONDS = 0.1  # polling interval for queries while there are other jobs
+QUERY_PAUSE_SECONDS = 0.02  # after a look, where commits are announced
+BATCH_NICENESS = 5  # of the threads that describe a batch: a query gets three times their share
 
 
 class Stage:
     """A thread that works on one batch at a time."""
 
-    def __init__(self, name: str) -> None:
-        self.executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
+    def __init__(self, name: str, niceness: int = 0) -> None:
+        # On Linux the niceness is that of a thread; elsewhere it would be that of the process.
+        self.executor = ThreadPoolExecutor(1, name, initializer=os.nice, initargs=(niceness,))
         self._current: Future[None] | None = None
 
     def start(self, work: Callable[[JobBatch], None], batch: JobBatch) -> None:
@@ -99,7 +104,8 @@ class ExtractorWorker:
         As the `only_worker`, so that none can be of another release, it reindexes outdated
         generations.
         """
-        settings = settings.for_device(choose_device(settings.device).type)
+        device = choose_device(settings.device).type
+        settings = settings.for_device(device)
         self._metrics = ExtractorMetrics(registry or CollectorRegistry())
         self._heartbeat = Heartbeat(settings.heartbeat_file)
         self._only_worker = only_worker
@@ -116,7 +122,8 @@ class ExtractorWorker:
         on_outcome = self._metrics.count_step_outcome
         self.fits = FitWorker(self.context, name, on_outcome, compute_fit, wakeups)
         self._runner = JobRunner(catalog, settings, name, DRAINED_JOBS, on_outcome, wakeups)
-        self._describing, self._publishing = Stage("describe"), Stage("publish")
+        niceness = BATCH_NICENESS if device == "cpu" and sys.platform == "linux" else 0
+        self._describing, self._publishing = Stage("describe", niceness), Stage("publish")
         self._queries = ThreadPoolExecutor(max_workers=1, thread_name_prefix="queries")
         self._query_lock = threading.Lock()  # held while a query, or an exclusive job, runs
         self._extractors = PolledValue(
@@ -156,7 +163,7 @@ class ExtractorWorker:
         """Stop the threads and decoders; claimed jobs are requeued when their lease expires."""
         for executor in (self._describing.executor, self._publishing.executor, self._queries):
             executor.shutdown()
-        self.context.close()
+        self.context.decoders.close()
 
     def drain(self, stop: threading.Event) -> bool:
         """Process jobs until none is claimable, or `stop` is set; return whether there was one."""
@@ -272,18 +279,20 @@ class ExtractorWorker:
             yield
         finally:
             done.set()
+            self.context.catalog.commits.count_one()  # ends the thread's wait
             answered.result()
 
     def _answer_queries(self, done: threading.Event) -> None:
+        commits = self.context.catalog.commits
         while not (done.is_set() or self._stop.is_set()):
-            query = None
+            query, seen = None, commits.count
             with self._query_lock:
                 if self._runner.has_jobs(Priority.QUERY, alone=False):
                     query = self._claim(Priority.QUERY, alone=False)
                 if query is not None:
                     self._run(query)
-            if query is None:
-                done.wait(QUERY_POLL_SECONDS)
+            if query is None and not done.wait(QUERY_PAUSE_SECONDS):
+                commits.wait(seen, QUERY_POLL_SECONDS)
 
 
 def _is_query(batch: JobBatch) -> bool:

@@ -17,9 +17,12 @@ import logging
 import os
 import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from shared.config.settings import Settings
 from shared.errors import StorageFull
+
+if TYPE_CHECKING:
+    from shared.config.settings import Settings
 
 log = logging.getLogger(__name__)
 

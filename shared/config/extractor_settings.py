@@ -96,7 +96,7 @@ class ExtractorSettings(BaseSettings):
         ge=1,
         le=MAX_DECODE_PROCESSES,
         description="number of decoding processes, unless set a quarter of the processors, at "
-        "least 2; with a GPU, all but two of them",
+        "least 2; with a GPU, all but two of them; with S3, which they wait for, twice as many",
     )
     pool_without_vocabulary: bool = Field(
         True,

@@ -195,7 +195,8 @@ class Settings(
         """Return the settings of an extractor on `cpu` or `cuda`, which decides what is unset."""
         processors = len(os.sched_getaffinity(0))
         decoders = processors - 2 if device == "cuda" else processors // 4
-        chosen = {"decode_processes": min(max(decoders, 2), MAX_DECODE_PROCESSES)}
+        decoders = max(decoders, 2) * (1 if self.s3_endpoint is None else 2)
+        chosen = {"decode_processes": min(decoders, MAX_DECODE_PROCESSES)}
         if device == "cuda":
             chosen["batch_photos"] = min(GPU_BATCH_PHOTOS, self.slot_rows)
         unset = chosen.keys() - self.model_fields_set

@@ -32,11 +32,17 @@ FOCAL_TIE_SHARE = 0.9
 ITERATIONS = 25
 UNKNOWN_FOCAL_SIGMA = 10.0
 """ln: no knowledge at all"""
-PRINCIPAL_POINT_SIGMA = 0.0025
-"""of the longer side, in each direction, around the middle of the photo"""
-RADIAL_SIGMA = 0.02
 PARAMETERS = 10
 """Centre, turn, ln(focal length), principal point and radial distortion"""
+
+
+@dataclass(frozen=True, slots=True)
+class LensSigmas:
+    """How far a lens may differ from what is known of it: standard deviations."""
+
+    principal_point: float
+    """of the longer side, in each direction"""
+    radial: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +68,7 @@ def estimate_absolute_pose(
     camera: Camera,
     focal_sigma: float | None,
     covariances: Floats | None = None,
-    *,
-    is_lens_known: bool = False,
+    lens: LensSigmas | None = None,
 ) -> AbsolutePose | None:
     """Return the pose that most pairs agree with; None if there is none.
 
@@ -73,8 +78,8 @@ def estimate_absolute_pose(
         camera: of the photo. Its focal length is ignored if `focal_sigma` is None.
         focal_sigma: relative standard deviation of the focal length; None if it is unknown.
         covariances: (m, 3, 3) of the points, for keypoints of one pixel at WORKING_SIDE.
-        is_lens_known: Whether principal point and distortion are exactly those of `camera`.
-            Otherwise they are estimated, too, and their errors are in the covariance.
+        lens: With it, principal point and distortion are estimated around those of `camera`, and
+            their errors are in the covariance. Without, they are exactly those of `camera`.
     """
     if len(pixels) < MIN_PAIRS:
         return None
@@ -92,9 +97,11 @@ def estimate_absolute_pose(
             position = -found.R.T @ found.t
             fits.append(_Fit(pixels, points, covariances, tried, found.R, position))
     refined = sorted(fits, key=lambda fit: fit.cost)[:REFINED_STARTS]
-    lens_sigmas = [PRINCIPAL_POINT_SIGMA * WORKING_SIDE] * 2 + [RADIAL_SIGMA]
-    lens_weights = [0.0] * 3 if is_lens_known else [sigma**-2 for sigma in lens_sigmas]
-    weights = np.array([0.0] * 6 + [_prior(focal_sigma), *lens_weights])
+    weights = np.zeros(PARAMETERS)
+    weights[6] = _prior(focal_sigma)
+    if lens is not None:
+        weights[7:9] = (lens.principal_point * WORKING_SIDE) ** -2
+        weights[9] = lens.radial**-2
     for fit in refined:
         fit.refine(weights)
     best = min(refined, key=lambda fit: fit.cost, default=None)

@@ -10,7 +10,7 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.geometry.absolute_pose import AbsolutePose, estimate_absolute_pose
+from shared.geometry.absolute_pose import AbsolutePose, LensSigmas, estimate_absolute_pose
 from shared.geometry.cameras import Camera, CameraSource, Floats
 from shared.geometry.component import Component
 from shared.matching.features import LocalFeatures
@@ -36,6 +36,10 @@ PANORAMA_RATIO = 1.95
 PLAUSIBLE_FOCAL_LENGTHS = (0.35, 4.0)
 FOCAL_SIGMAS = {CameraSource.GIVEN: 0.01, CameraSource.EXIF: 0.04, CameraSource.MAP: 0.01}
 """Relative standard deviation of a focal length by its source"""
+MAP_LENS = LensSigmas(principal_point=0.0025, radial=0.02)
+"""of a camera whose photos are in the map"""
+OTHER_LENS = LensSigmas(principal_point=0.005, radial=0.05)
+"""of any other: the axes of real lenses are 0.3 to 1.5 % of the longer side beside the middle"""
 FOCAL_TIE = 1.1
 """Another focal length contradicts only if it explains so many times as many keypoints"""
 MAX_FOCAL_SIGMAS = 4.0
@@ -126,9 +130,7 @@ def localise(
     source = camera_source if camera else CameraSource.ESTIMATED
     tried = camera or Camera.of_focal_length(query.width, query.height, 1.0)
     found = [
-        (pairs, pose)
-        for pairs in groups
-        if (pose := _estimate(pairs, components, tried, FOCAL_SIGMAS.get(source)))
+        (pairs, pose) for pairs in groups if (pose := _estimate(pairs, components, tried, source))
     ]
     found.sort(key=lambda each: -each[0].keypoints(each[1]))
     count = found[0][0].keypoints(found[0][1]) if found else 0
@@ -158,18 +160,18 @@ def localise(
 
 
 def _estimate(
-    pairs: _Pairs, components: Sequence[Component], camera: Camera, focal_sigma: float | None
+    pairs: _Pairs, components: Sequence[Component], camera: Camera, source: CameraSource
 ) -> AbsolutePose | None:
     component, numbers = components[pairs.component], pairs.point_numbers
     covariances = component.covariances[numbers].astype(float)
-    points = component.points[numbers]
+    lens = MAP_LENS if source == CameraSource.MAP else OTHER_LENS
     return estimate_absolute_pose(
         pairs.pixels,
-        points,
+        component.points[numbers],
         camera,
-        focal_sigma,
+        FOCAL_SIGMAS.get(source),
         covariances,
-        is_lens_known=camera.rays is not None,
+        lens if camera.rays is None else None,
     )
 
 
@@ -217,7 +219,7 @@ def _doubt_focal_length(
     pairs: _Pairs, pose: AbsolutePose, components: Sequence[Component], source: CameraSource
 ) -> str | None:
     """Return why the focal length that was used contradicts the matches, in words."""
-    free = _estimate(pairs, components, pose.camera, None)
+    free = _estimate(pairs, components, pose.camera, CameraSource.ESTIMATED)
     if free is None or pairs.keypoints(free) <= FOCAL_TIE * pairs.keypoints(pose):
         return None
     used = pose.camera.focal_length

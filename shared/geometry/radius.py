@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from shared.geometry.cameras import Floats
+from shared.geometry.cameras import CameraSource, Floats
 from shared.geometry.component import quaternion_of
 from shared.geometry.frames import (
     Attitude,
@@ -17,7 +17,7 @@ from shared.geometry.frames import (
     attitude_of,
     geopose_rotation,
 )
-from shared.geometry.localise import LocalPose
+from shared.geometry.localise import OTHER_LENS, LocalPose
 
 CAMERA_MODEL_SIGMA = 0.0025
 """radians by which rays are off together, beyond what the covariance of a pose says: of a model
@@ -48,6 +48,8 @@ class PoseCalibration(BaseModel):
     """of the left-out photos that were found"""
     poses: int = Field(ge=0)
     """found; with fewer than 40 the quantiles are hardly more than a guess"""
+    known_lens: PoseCalibration | None = None
+    """of photos whose lens is known, by the map or exactly; the others hold for any lens"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +79,8 @@ def geo_pose(
     model. Heading, pitch and roll
     are relative to north and up at the position itself, not at the origin.
     """
+    if pose.camera_source == CameraSource.MAP or pose.camera.rays is not None:
+        calibration = calibration.known_lens or calibration
     place = origin.to_geographic(similarity.apply(pose.position))
     # From the plane at the position to that at the origin.
     turn = origin.axes @ place.axes.T
@@ -95,7 +99,11 @@ def geo_pose(
     )
     jacobian = _heading_jacobian(rotation) @ turn.T
     turned = float(jacobian @ similarity.covariance[:3, :3] @ jacobian)
-    turned = math.sqrt(turned + similarity.drift_radians**2 + CAMERA_MODEL_SIGMA**2)
+    off_axis = CAMERA_MODEL_SIGMA
+    if pose.camera_source == CameraSource.MAP and pose.camera.rays is None:
+        # What a camera of the map has beside its middle is in the turn of all its photos.
+        off_axis = OTHER_LENS.principal_point / pose.camera.focal_length
+    turned = math.sqrt(turned + similarity.drift_radians**2 + off_axis**2)
     degrees = [
         math.degrees(math.hypot(factor * heading, normal * turned))
         for factor, normal in zip(

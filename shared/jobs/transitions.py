@@ -33,6 +33,24 @@ def _drop_lease(job: Job) -> None:
     job.lease_until = None
 
 
+def _end(job: Job, state: JobState) -> None:
+    job.state = state
+    _clear_waiting(job)
+    _drop_lease(job)
+    session = _session_of(job)
+    # A value read once: with `db_now()` in their place, each job of a batch is a statement.
+    if "now" not in session.info:
+        with session.no_autoflush:
+            session.info["now"] = session.scalar(select(db_now()))
+    job.finished_at = session.info["now"]
+
+
+def _session_of(job: Job) -> Session:
+    session = object_session(job)
+    assert session is not None, "a job ends in a transaction"
+    return session
+
+
 def _clear_waiting(job: Job) -> None:
     job.waiting_for = None
     job.awaited = None
@@ -45,33 +63,26 @@ def succeed_job(job: Job, result: dict[str, Any] | None = None) -> None:
     (`requeue_job_as_new`).
     """
     has_succeeded_before = job.result is not None
-    job.state = JobState.SUCCEEDED
     job.result = result
     job.error = None
-    _clear_waiting(job)
     job.progress_done = job.progress_total - job.progress_failed
-    job.finished_at = db_now()
-    _drop_lease(job)
+    _end(job, JobState.SUCCEEDED)
     if not has_succeeded_before:
         _enqueue_job_event(job, EventKind.JOB_SUCCEEDED)
 
 
 def fail_job(job: Job, problem: dict[str, Any]) -> None:
     """Mark the job as failed and store the reason, an RFC 9457 problem."""
-    job.state = JobState.FAILED
     job.error = problem
-    _clear_waiting(job)
     if job.progress_total == 1:
         job.progress_failed = 1
-    job.finished_at = db_now()
-    _drop_lease(job)
+    _end(job, JobState.FAILED)
     _enqueue_job_event(job, EventKind.JOB_FAILED)
 
 
 def _enqueue_job_event(job: Job, event: EventKind) -> None:
     """Queue the job's event for webhooks; a model change sends one event, not one per photo."""
-    session = object_session(job)
-    assert session is not None, "a job ends in a transaction"
+    session = _session_of(job)
     events = [event] if job.kind != JobKind.REINDEX else []
     if job.kind == JobKind.BATCH:
         events.append(EventKind.BATCH_FINISHED)
@@ -138,10 +149,7 @@ def cancel_job(job: Job) -> None:
             job_id=str(job.id),
             state=job.state,
         )
-    job.state = JobState.CANCELLED
-    _clear_waiting(job)
-    job.finished_at = db_now()
-    _drop_lease(job)
+    _end(job, JobState.CANCELLED)
 
 
 CANCELLED_PER_TRANSACTION = 1000  # a map, a generation or a batch has as many jobs as photos

@@ -39,7 +39,8 @@ class ComponentResponse(ResponseModel):
     calibration: dict[str, Any] | None = Field(
         description="errors of the poses of its own photos, each localised without itself, in "
         "standard deviations (`position_68`, `position_95`, `heading_68`, `heading_95`), the share "
-        "that was found (`share_found`), and the number of `poses` that this rests on"
+        "that was found (`share_found`), and the number of `poses` that this rests on; "
+        "`known_lens` has the same of queries by the cameras of the map"
     )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
-import threading
 from collections.abc import Iterator
 from typing import Any
 from uuid import uuid4
@@ -13,7 +12,7 @@ from uuid import uuid4
 import httpx2
 
 from tests.support.photos import photo_bytes
-from tests.support.problems import field_refused, problem
+from tests.support.problems import problem
 from tests.support.server import ServerProcess, environment, run_command
 
 # One photo per batch, so that of several photos only the first ones are under way.
@@ -124,21 +123,6 @@ def test_unknown_jobs_are_not_found(server: ServerProcess) -> None:
         problem(server.client.get(f"{JOBS}/{job_id}/events"), 404, "job_not_found")
         problem(post(server, job_id, "cancel"), 404, "job_not_found")
         problem(post(server, job_id, "retry"), 404, "job_not_found")
-
-
-def test_waiting_for_a_job_ends_with_the_job(server: ServerProcess) -> None:
-    with server.no_decoding():
-        job_id = server.upload(photo_bytes(next(fresh))).json()["job_id"]
-        waited = get(server, f"{JOBS}/{job_id}", wait=0.2)
-        assert waited["state"] in ("queued", "running"), "the wait is over before the job"
-        seen: list[dict[str, Any]] = []
-        waiting = threading.Thread(
-            target=lambda: seen.append(get(server, f"{JOBS}/{job_id}", wait=60))
-        )
-        waiting.start()
-    waiting.join()
-    assert seen[0]["state"] == "succeeded"
-    field_refused(server.client.get(f"{JOBS}/{job_id}", params={"wait": -1}), "wait")
 
 
 def events(lines: Iterator[str]) -> Iterator[dict[str, str]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import socket
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -45,26 +44,6 @@ def test_probes_and_health_say_that_every_part_works(server: ServerProcess) -> N
         *("catalog", "object_store", "search", "extractors", "queue", "uploads"),
     }
     assert {part["status"] for part in body["parts"].values()} == {"healthy"}
-
-
-def test_every_call_is_described_once(server: ServerProcess) -> None:
-    described = got(server.client.get("/openapi.json"))
-    calls = {
-        f"{method.upper()} {path}": call
-        for path, methods in described["paths"].items()
-        for method, call in methods.items()
-    }
-    names = Counter(call["operationId"] for call in calls.values())
-    assert set(names.values()) == {1}, names
-    for name, call in calls.items():
-        assert call["description"], name
-        assert "application/problem+json" in call["responses"]["4XX"]["content"], name
-    form = calls[f"POST {API}/upload"]["requestBody"]["content"]["multipart/form-data"]["schema"]
-    assert form["required"] == ["file"]
-    assert set(form["properties"]) == {
-        *("file", "latitude", "longitude", "altitude", "heading"),
-        *("captured_at", "place", "tags", "metadata", "role", "relative_path"),
-    }
 
 
 def test_statistics_follow_uploads_and_deletions(server: ServerProcess) -> None:

@@ -24,7 +24,8 @@ REPOSITORY = Path(__file__).parents[2]
 README = REPOSITORY / "README.md"
 ADDRESS = "127.0.0.1:8000"
 SUCCEEDED = '"state":"succeeded"'
-LONG = {"--places 300": "--places 8"}  # drawing a city takes a minute; a hamlet shows as much
+# Drawing and indexing a city takes minutes; a hamlet shows as much.
+LONG = {"--places 300": "--places 8 --views 2 --size 96x72"}
 STARTED_BY_HAND = ("make run", "make test")
 UUID = r"[0-9a-f]{8}-[0-9a-f]{4}-7[0-9a-f]{3}-[0-9a-f]{4}-[0-9a-f]{12}"
 

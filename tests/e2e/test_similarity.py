@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 from uuid import uuid4
 
@@ -15,39 +14,7 @@ from tests.support.problems import field_refused, problem
 from tests.support.server import ServerProcess
 
 PLACES = 8
-AT_ONCE = 25
-
-# None of them is to be turned away because others are on their way.
-SETTINGS = {"max_concurrent_uploads": 4 * AT_ONCE}
 SIMILARITY = "/api/v1/similarity"
-ANSWER_FIELDS = {
-    "query_file_id",
-    "query_filename",
-    "processing_time_ms",
-    "total_similar",
-    "similar_images",
-    "vocabulary",
-    "certificate",
-    "rows_scanned",
-    "rows_reranked",
-    "snapshot_version",
-}
-PHOTO_FIELDS = {
-    "image_id",
-    "image_path",
-    "original_filename",
-    "similarity_score",
-    "upload_time",
-    "file_size",
-    "width",
-    "height",
-    "metadata",
-    "tags",
-    "latitude",
-    "longitude",
-    "image_url",
-    "thumbnail_url",
-}
 # Each test that changes the map takes photos of its own.
 fresh = itertools.count(1000)
 
@@ -92,42 +59,6 @@ def test_a_near_copy_finds_its_place_first(server: ServerProcess, places: list[s
         assert best["original_filename"] == f"place-{number}.jpg"
         assert (best["latitude"], best["longitude"]) == (40 + number, 7)
         assert best["similarity_score"] > 0.9 > scores(body)[1]
-
-
-def test_an_answer_has_all_fields_that_are_documented(
-    server: ServerProcess, places: list[str]
-) -> None:
-    of_new = answered(server.ask(re_encoded(1)))
-    of_stored = answered(server.similar(places[0]))
-    for body in (of_new, of_stored):
-        assert set(body) >= ANSWER_FIELDS
-        assert body["total_similar"] == len(body["similar_images"])
-        assert body["processing_time_ms"] > 0
-        assert body["vocabulary"] == "none"
-        assert all(set(found) >= PHOTO_FIELDS for found in body["similar_images"])
-    assert of_new["query_file_id"] is None
-    assert of_new["query_filename"] == "query.jpg"
-    assert of_stored["query_file_id"] == places[0]
-    assert of_stored["query_filename"] == "place-1.jpg"
-
-    found = of_new["similar_images"][0]
-    assert found["tags"] == ["a", "b"]
-    assert server.client.get(found["image_url"]).content == photo_bytes(1)
-    assert server.client.get(found["image_path"]).content == photo_bytes(1)
-    assert server.client.get(found["thumbnail_url"]).headers["content-type"] == "image/jpeg"
-
-
-def test_min_score_leaves_out_what_is_less_similar(
-    server: ServerProcess, places: list[str]
-) -> None:
-    all_of_them = answered(server.similar(places[0], top_k=100))
-    middle = scores(all_of_them)[3]
-    expected = [score for score in scores(all_of_them) if score >= middle - 1e-9]
-    body = answered(server.similar(places[0], top_k=100, min_score=middle - 1e-9))
-    assert scores(body) == pytest.approx(expected)
-    nearly_same = answered(server.ask(re_encoded(2), top_k=100, min_score=0.9))
-    assert ids(nearly_same) == [places[1]]
-    assert answered(server.ask(photo_bytes(next(fresh)), min_score=1))["similar_images"] == []
 
 
 def test_a_bad_parameter_is_refused_by_name(server: ServerProcess, places: list[str]) -> None:
@@ -196,25 +127,6 @@ def test_a_query_that_takes_longer_than_preferred_becomes_a_job(server: ServerPr
 def test_only_queries_have_results(server: ServerProcess) -> None:
     job_id = server.upload(photo_bytes(1)).json()["job_id"]
     problem(server.client.get(f"/api/v1/jobs/{job_id}/result"), 409, "no_result")
-
-
-def test_uploads_and_searches_at_once_all_succeed(server: ServerProcess, places: list[str]) -> None:
-    numbers = [next(fresh) for _ in range(AT_ONCE)]
-
-    def do(task: int) -> httpx2.Response:
-        which, what = divmod(task, 2)
-        if what == 0:
-            return server.upload(photo_bytes(numbers[which]))
-        if which % 2:
-            return server.ask(re_encoded(1 + which % PLACES), wait=60)
-        return server.similar(places[which % PLACES])
-
-    with ThreadPoolExecutor(2 * AT_ONCE) as pool:
-        answers = list(pool.map(do, range(2 * AT_ONCE)))
-    assert [a.status_code for a in answers] == [202, 200] * AT_ONCE, [a.text for a in answers]
-    for number, answer in zip(numbers, answers[::2], strict=True):
-        assert server.finished(answer.json()["job_id"])["state"] == "succeeded"
-        assert ids(answered(server.ask(photo_bytes(number), top_k=1))) == [answer.json()["file_id"]]
 
 
 def test_every_search_counts_and_no_query_photo_is_kept(

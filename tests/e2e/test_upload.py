@@ -3,17 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import http.client
-import json
-import socket
-import threading
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-import httpx2
 import pytest
 from PIL import Image
 from PIL.ExifTags import GPS, IFD
@@ -23,9 +16,7 @@ from tests.support.problems import field_refused, problem
 from tests.support.server import ServerProcess
 from tests.support.waiting import wait_until
 
-MAX_FILE_SIZE = 100_000
 UPLOAD = "/api/v1/upload"
-SETTINGS = {"max_file_size": MAX_FILE_SIZE, "max_concurrent_uploads": 1}
 
 
 def stored(server: ServerProcess) -> set[Path]:
@@ -188,91 +179,6 @@ def test_a_bad_upload_is_refused_and_leaves_nothing(server: ServerProcess) -> No
     problem(nowhere, 404, "map_not_found")
     field_refused(server.upload(JPEG, latitude="91", longitude="7"), "latitude")
     field_refused(server.upload(JPEG, role="admin"), "role")
-    check_nothing_is_left(server, before)
-
-
-BEGIN_OF_FORM = b'--xx\r\nContent-Disposition: form-data; name="file"; filename="p.jpg"\r\n\r\n'
-
-
-def answer_to_unfinished(
-    server: ServerProcess, headers: list[str], body: list[bytes]
-) -> tuple[int, str, dict[str, Any]]:
-    """What the server answers to a request whose body never ends."""
-    url = httpx2.URL(str(server.client.base_url))
-    head = [
-        f"POST {UPLOAD} HTTP/1.1",
-        f"Host: {url.host}",
-        "Content-Type: multipart/form-data; boundary=xx",
-        *headers,
-        "",
-        "",
-    ]
-    with socket.create_connection((url.host, url.port or 80), timeout=30) as connection:
-        connection.sendall("\r\n".join(head).encode())
-        for piece in body:
-            connection.sendall(piece)
-        answer = http.client.HTTPResponse(connection)
-        answer.begin()
-        return answer.status, answer.headers.get_content_type(), json.load(answer)
-
-
-def test_one_concurrent_upload_too_many_gets_retry_after(server: ServerProcess) -> None:
-    goes_on = threading.Event()
-
-    def slow_form() -> Iterator[bytes]:
-        yield BEGIN_OF_FORM + photo_bytes(80)
-        goes_on.wait(timeout=60)
-        yield b"\r\n--xx--\r\n"
-
-    def receiving() -> Any:
-        return server.client.get("/api/v1/health").json()["load"]["receiving_uploads"]
-
-    form = {"Content-Type": "multipart/form-data; boundary=xx"}
-    with ThreadPoolExecutor(1) as pool:
-        slow = pool.submit(server.client.post, UPLOAD, content=slow_form(), headers=form)
-        try:
-            while not receiving():
-                assert not slow.done()
-            refused = server.upload(photo_bytes(81))
-            problem(refused, 429, "too_many_uploads")
-            assert int(refused.headers["retry-after"]) >= 1
-            assert server.ask(photo_bytes(82)).is_success, "a query photo has room of its own"
-        finally:
-            goes_on.set()
-        assert slow.result().status_code == 202
-    assert receiving() == 0
-
-
-def chunk(data: bytes) -> bytes:
-    return f"{len(data):x}\r\n".encode() + data + b"\r\n"
-
-
-@pytest.mark.parametrize(
-    ("headers", "body", "status", "code"),
-    [
-        pytest.param(
-            ["Transfer-Encoding: chunked"],
-            [chunk(BEGIN_OF_FORM + b"\xff\xd8\xff\xe0"), *[chunk(b"\0" * 60_000)] * 2],
-            413,
-            "file_too_large",
-            id="too large without a declared length",
-        ),
-        pytest.param(
-            ["Transfer-Encoding: chunked"],
-            [chunk(BEGIN_OF_FORM + b"no photo, whatever follows")],
-            415,
-            "unsupported_photo",
-            id="no photo by its first bytes",
-        ),
-    ],
-)
-def test_a_hopeless_body_is_refused_before_it_ends(
-    server: ServerProcess, headers: list[str], body: list[bytes], status: int, code: str
-) -> None:
-    before = stored(server)
-    answered, media_type, refusal = answer_to_unfinished(server, headers, body)
-    assert (answered, refusal["code"]) == (status, code)
-    assert media_type == "application/problem+json"
     check_nothing_is_left(server, before)
 
 

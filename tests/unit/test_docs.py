@@ -37,10 +37,16 @@ def test_codes_that_a_page_names_with_their_status_exist(name: str) -> None:
     assert named - make_reference.error_codes().keys() == set()
 
 
-def test_every_call_is_described_in_a_sentence() -> None:
-    for path, methods in openapi_description()["paths"].items():
-        for method, call in methods.items():
-            assert call.get("description"), f"{method} {path}"
+def test_every_call_is_described_once_with_its_errors() -> None:
+    calls = {
+        f"{method} {path}": call
+        for path, methods in openapi_description()["paths"].items()
+        for method, call in methods.items()
+    }
+    assert len({call["operationId"] for call in calls.values()}) == len(calls)
+    for name, call in calls.items():
+        assert call["description"], name
+        assert "application/problem+json" in call["responses"]["4XX"]["content"], name
 
 
 @pytest.mark.parametrize("found", PAGES, ids=lambda path: str(path.relative_to(ROOT)))

@@ -1,9 +1,8 @@
-"""`placewise datasets`: check data sets, compute ground truth and audit labels.
+"""`placewise datasets`: check data sets and compute ground truth.
 
 `check` reports what a folder contains and what is wrong with it. `list` prints the photos of an
-evaluation set in order. `ground-truth` computes the
-positives of queries from positions. `audit` lists confident matches that the ground truth calls
-wrong although they may be right. `synth` is in its own module.
+evaluation set in order. `ground-truth` computes the positives of queries from positions. `synth` is
+in its own module.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 from rich.markup import escape
 from rich.table import Column
@@ -23,11 +21,8 @@ from rich.table import Column
 from lab.cli.datasets.synth import synth
 from lab.cli.evaluation.commands import ProtocolOption, RuleOption
 from lab.datasets.check import (
-    MAX_RULE_MULTIPLE,
     DatasetProblem,
     DatasetReport,
-    SuspectLabel,
-    find_suspect_labels,
     find_undecodable_photos,
     inspect_dataset,
 )
@@ -286,88 +281,8 @@ def _resolve_rule(radius: float | None, rule: str | None) -> PositiveRule:
     return parse_rule(rule)
 
 
-MAX_SUSPECTS_SHOWN = 50
-
-
-def audit(
-    folder: Annotated[Path, typer.Argument(help="Folder of the data set.")],
-    predictions: Annotated[
-        Path, typer.Option(help="(queries, k) database indices, best first, .npy.")
-    ],
-    scores: Annotated[
-        Path | None, typer.Option(help="(queries, k) similarity scores, .npy.")
-    ] = None,
-    min_score: Annotated[
-        float | None,
-        typer.Option(help="Minimum confident score. Default: the median score of correct matches."),
-    ] = None,
-    name: Annotated[
-        str | None,
-        typer.Option("--set", help="Set of the data set. Required if there are several."),
-    ] = None,
-    protocol: ProtocolOption = None,
-    rule: RuleOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """List confident first matches that are near the query but count as wrong.
-
-    Near means within 4 times the criterion's metres or frames, regardless of heading. Review these
-    pairs: if both photos show the same place, the ground truth is wrong, not the descriptor.
-    """
-    # Loads faiss, which the other commands do not need.
-    from lab.evaluation.results import check_predictions, load_matrix, read_predictions
-
-    evaluation = open_evaluation_set(folder, name, protocol=protocol, rule=rule)
-    ranked = read_predictions(predictions)
-    check_predictions(predictions, ranked, evaluation.positives, len(evaluation.database))
-    score_rows = None
-    if scores is not None:
-        expected = "a (queries, k) array of scores"
-        score_rows = load_matrix(scores, "f", "bad_predictions", expected).astype(np.float32)
-    suspects = find_suspect_labels(evaluation, ranked, score_rows, min_score=min_score)
-    if as_json:
-        print_json(
-            {
-                "set": evaluation.name,
-                "rule": evaluation.rule,
-                "protocol": evaluation.protocol,
-                "fingerprint": evaluation.fingerprint,
-                "queries": len(evaluation.queries),
-                "suspects": [asdict(suspect) for suspect in suspects],
-            }
-        )
-        return
-    print_message(
-        f"{len(suspects)} of {len(evaluation.queries)} queries of {evaluation.name} have a "
-        f"confident first match within {MAX_RULE_MULTIPLE:g} times {evaluation.rule} that "
-        "counts as wrong."
-    )
-    if suspects:
-        _print_suspects(suspects)
-
-
-def _print_suspects(suspects: list[SuspectLabel]) -> None:
-    table = Table(
-        *(Column(name, justify="right") for name in ("score", "metres", "degrees")),
-        "query",
-        "first match",
-    )
-    for suspect in suspects[:MAX_SUSPECTS_SHOWN]:
-        table.add_row(
-            "-" if suspect.score is None else f"{suspect.score:.3f}",
-            "-" if suspect.metres is None else f"{suspect.metres:.1f}",
-            "-" if suspect.degrees is None else f"{suspect.degrees:.0f}",
-            escape(suspect.query_name),
-            escape(suspect.database_name),
-        )
-    print_table(table)
-    if len(suspects) > MAX_SUSPECTS_SHOWN:
-        print_message(f"and {len(suspects) - MAX_SUSPECTS_SHOWN} more. --json lists all of them.")
-
-
 app = typer.Typer(help="Check, complete and generate data sets.", no_args_is_help=True)
 app.command("check")(check)
 app.command("list")(list_photos)
 app.command("ground-truth")(ground_truth)
-app.command("audit")(audit)
 app.command("synth")(synth)

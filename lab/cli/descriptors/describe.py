@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -78,8 +77,6 @@ def describe(
     per photo with the dataset `global_descriptor`. If a photo can't be described, it is reported
     and no file is written.
     """
-    # Must be set before torch is loaded below; see services/cli/__init__.py.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     names = _hdf5_names(photos, out, root)
     settings = read_settings()
     if checkpoint is not None:

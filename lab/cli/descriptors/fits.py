@@ -13,6 +13,7 @@ import numpy as np
 from rich.progress import Progress
 
 from lab.cli.descriptors.extractors import load_own_vocabulary, photo_decoder, resolve_centres
+from lab.evaluation.results import load_matrix
 from lab.training.describing import Refused
 from services.cli.descriptors.load_extractor import load_extractor
 from services.cli.environment import read_settings
@@ -142,7 +143,13 @@ def fit_pca_locally(
                 "options_contradict",
                 "--extractor and --vocabulary apply only to a fit on photos.",
             )
-        rows = _open_row_file(source)
+        rows = load_matrix(
+            source,
+            "f",
+            "bad_rows",
+            "a two-dimensional array of floating point numbers, one row per photo, as `placewise "
+            "describe` writes it",
+        )
         dimension = rows.shape[1]
         check_pca_fittable(len(rows), dimension, components)
         sampled = sample_rows(len(rows), sample_size(dimension, components), SEED)
@@ -177,23 +184,6 @@ def _load_extractor(
 
 def _refusals(refused: Refused) -> list[dict[str, str]]:
     return [{"path": utf8_path(path), "reason": error.detail} for path, error in refused]
-
-
-def _open_row_file(file: Path) -> Rows:
-    """Memory-map (n, D) descriptors."""
-    try:
-        rows: Rows = np.load(file, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InvalidRequest(
-            "bad_rows", f"{printable_path(file)} is not a valid .npy file: {error}."
-        ) from error
-    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.dtype.kind != "f":
-        raise InvalidRequest(
-            "bad_rows",
-            f"{printable_path(file)} must contain a two-dimensional array of floating point "
-            "numbers, one row per photo, as `placewise describe` writes it.",
-        )
-    return rows
 
 
 def _read_rows(rows: Rows, indices: Any) -> Iterator[Rows]:

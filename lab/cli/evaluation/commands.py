@@ -7,7 +7,6 @@ work import torch and are imported when they are needed.
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -195,10 +194,10 @@ def evaluate(
     """Measure retrieval recall in a live map or on a data set.
 
     Without --data and --predictions, evaluate the map with its own photos (leave-one-out) and its
-    labelled queries. With --data, evaluate a --checkpoint, an --extractor, --rows or a --server on
-    a data set. With --predictions, evaluate a file of predictions.
+    labelled queries. With --data, evaluate a --checkpoint, an --extractor or --rows on a data set.
+    With --predictions, evaluate a file of predictions.
     """
-    map_options: OptionValues = {"--sample": sample, "--seed": seed}
+    map_options: OptionValues = {"--sample": sample, "--seed": seed, "--map": map_name}
     model_options: OptionValues = {
         "--checkpoint": checkpoint, "--extractor": extractor, "--vocabulary": vocabulary,
         "--fit-vocabulary": fit_vocabulary, "--protocol": protocol, "--rule": rule, "--rows": rows,
@@ -214,8 +213,6 @@ def evaluate(
         out, against, pairs, depth, _parse_recall_at(recall_at, depth), grids, only_wrong,
         faiss_gpu, place_labels_are_paths, as_json,
     )  # fmt: skip
-    # Must be set before torch is loaded below; see services/cli/__init__.py.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if predictions is not None:
         rules: OptionValues = {"--protocol": protocol, "--rule": rule}
         models = {name: value for name, value in model_options.items() if name not in rules}
@@ -251,9 +248,7 @@ def evaluate(
         from lab.cli.evaluation.data_sets import EvaluationTarget, evaluate_sets
 
         size = _parse_image_size(image_size, checkpoint)
-        target = EvaluationTarget(
-            checkpoint, size, extractor, rows, vocabulary, fit_vocabulary, server, map_name, key
-        )
+        target = EvaluationTarget(checkpoint, size, extractor, rows, vocabulary, fit_vocabulary)
         if sequences:
             from lab.cli.evaluation.sequences import evaluate_sequences
 
@@ -362,8 +357,6 @@ def compare(
     Descriptors of a data set are cached in PLACEWISE_HOME/descriptors: a repeated run describes
     only what is missing. On a map of this machine, those whose weights are here are compared.
     """
-    # Must be set before torch is loaded below; see services/cli/__init__.py.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if data is None:
         from lab.cli.evaluation.compare_on_map import compare_on_map
 

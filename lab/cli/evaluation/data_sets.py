@@ -1,21 +1,13 @@
-"""`placewise evaluate --data DIR`: evaluate a model, rows of descriptors or a server on data sets.
-
-A server is evaluated over HTTP: the set's database photos are uploaded to a map, and its queries
-are sent as unstored query photos. Imports torch.
-"""
+"""`placewise evaluate --data DIR`: evaluate a model or rows of descriptors. Imports torch."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import re
-import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
-from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,151 +25,21 @@ from lab.evaluation.ranking import (
     Rows,
     describe_evaluation_set,
     describe_to_matrix,
-    refused_photos_error,
 )
 from lab.evaluation.results import EvaluationResult, EvaluationRun, load_matrix, read_comparable_run
-from placewise.answers import Similar, Uploaded
-from placewise.client import Client
-from services.cli.client import active_generation, connect
 from services.cli.environment import read_settings
-from services.cli.ingest.upload import (
-    RETRY_PERIOD_SECONDS,
-    UPLOAD_CONCURRENCY,
-    wait_for_automatic_fit,
-    wait_until_described,
-)
 from services.cli.output import progress_bar, stage_bars
 from shared.config.settings import Settings
-from shared.errors import Conflict, InvalidRequest, NotFound, Unavailable, Unprocessable
+from shared.errors import InvalidRequest, NotFound
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH
 from shared.evaluation.places.levels import LevelScheme
 
 Result = TypeVar("Result")
 
 
-def _evaluate_server(
-    evaluation_set: EvaluationSet, target: EvaluationTarget, depth: int, progress: Progress
-) -> tuple[Rankings, EvaluationRun, dict[str, Any]]:
-    """Rank the database photos for each query through a server's HTTP API.
-
-    The map, by default one named after the set, is created if it does not exist. A repeated
-    evaluation describes no photo twice. No positions are sent: results depend on the images only.
-    """
-    set_name = re.sub(r"[^a-z0-9]+", "-", evaluation_set.name.lower()).strip("-")
-    name = target.map_name or f"evaluate-{set_name}"
-    with connect(target.server, None, target.key) as client:
-        if name not in {map_.name for map_ in client.maps()}:
-            client.create_map(name)
-    with connect(target.server, name, target.key) as client:
-        retrying_client = client.with_patience(RETRY_PERIOD_SECONDS, lambda error, seconds: None)
-        indices_by_file = _upload_database(retrying_client, evaluation_set, name, progress)
-        bar = progress.add_task(
-            f"{evaluation_set.name}: querying", total=len(evaluation_set.queries)
-        )
-
-        def query(photo: Path) -> tuple[Similar, float]:
-            started = time.perf_counter()
-            k = min(depth, len(indices_by_file))
-            response = retrying_client.similar(photo, top_k=k, history=False)
-            progress.advance(bar)
-            return response, time.perf_counter() - started
-
-        responses = _map_concurrently(query, [photo.path for photo in evaluation_set.queries])
-        active = active_generation(client)
-    generation = active.as_json() if active else {}
-    k = min(depth, len(evaluation_set.database))
-    ranked = Rankings(
-        np.empty((len(responses), k), np.int64), np.empty((len(responses), k), np.float32)
-    )
-    for row, (response, _) in enumerate(responses):
-        _fill_ranking(ranked, row, response, indices_by_file, evaluation_set.queries[row].name)
-    run = EvaluationRun(
-        f"map {name}",
-        None,
-        {
-            "extractor": generation.get("extractor"),
-            "vocabulary": generation.get("vocabulary_id"),
-            "generation": generation.get("generation_id"),
-        },
-    )
-    seconds = [duration for _, duration in responses]
-    median_ms = 1000 * float(np.median(seconds))
-    return ranked, run, {"dimension": generation.get("dimension"), "answer_ms_median": median_ms}
-
-
-def _upload_database(
-    client: Client, evaluation_set: EvaluationSet, name: str, progress: Progress
-) -> dict[UUID, list[int]]:
-    """Upload the database photos; returns the database indices by file id, the same for twins."""
-    bar = progress.add_task(f"{evaluation_set.name}: uploading", total=len(evaluation_set.database))
-
-    def upload(index: int) -> Uploaded:
-        photo = evaluation_set.database[index]
-        response = client.upload(photo.path, filename=Path(photo.name).name)
-        progress.advance(bar)
-        return response
-
-    uploaded = _map_concurrently(upload, range(len(evaluation_set.database)))
-    indices_by_file: dict[UUID, list[int]] = {}
-    for index, response in enumerate(uploaded):
-        indices_by_file.setdefault(response.file_id, []).append(index)
-    for response in uploaded:
-        if response.job_id is not None:
-            wait_until_described(client, response.job_id)
-    fit = wait_for_automatic_fit(client, progress)
-    if fit is not None:
-        fit.raise_for_failure()
-    stats = client.stats()
-    if stats.total_images != len(indices_by_file):
-        raise Conflict(
-            "map_holds_others",
-            f"Map {name} contains {stats.total_images} photos instead of the "
-            f"{len(indices_by_file)} of {evaluation_set.name}. Other photos would change the "
-            "results. Use another --map, or delete this one.",
-        )
-    bar = progress.add_task(f"{evaluation_set.name}: describing", total=len(indices_by_file))
-    failed = []
-    for index, response in enumerate(uploaded):
-        if response.job_id is None or indices_by_file[response.file_id][0] != index:
-            continue
-        try:
-            client.wait(response)
-        except Unprocessable as error:
-            failed.append((evaluation_set.database[index].path, error))
-        progress.advance(bar)
-    if failed:
-        raise refused_photos_error(failed, len(evaluation_set.database))
-    return indices_by_file
-
-
-def _map_concurrently(function: Callable[[Any], Result], items: Sequence[Any]) -> list[Result]:
-    """Apply a function to each item in parallel threads; results are in the order of the items."""
-    with ThreadPoolExecutor(UPLOAD_CONCURRENCY) as pool:
-        return list(pool.map(function, items))
-
-
-def _fill_ranking(
-    ranked: Rankings, row: int, response: Similar, indices_by_file: dict[UUID, list[int]], name: str
-) -> None:
-    k = ranked.indices.shape[1]
-    matches = [
-        (index, image.similarity_score)
-        for image in response.similar_images
-        for index in indices_by_file[image.image_id]
-    ][:k]
-    if len(matches) < k:
-        raise Unavailable(
-            "answer_short",
-            f"The server returned {len(matches)} of {k} photos for {name}. Check that all search "
-            "shards are available, and try again.",
-        )
-    ranked.indices[row] = [index for index, _ in matches]
-    ranked.scores[row] = [score for _, score in matches]
-
-
 @dataclass(frozen=True, slots=True)
 class EvaluationTarget:
-    """The model or server to evaluate."""
+    """The model to evaluate."""
 
     checkpoint: Path | None
     image_size: str | tuple[int, int]
@@ -186,9 +48,6 @@ class EvaluationTarget:
     """`.npy` files with the descriptors of the database and of the queries"""
     vocabulary: Path | None
     fit_vocabulary: bool
-    server: str | None
-    map_name: str | None
-    key: str | None
 
     def check(self) -> None:
         """Check that exactly one target is given.
@@ -207,11 +66,11 @@ class EvaluationTarget:
             raise InvalidRequest(
                 "options_contradict", "--vocabulary and --fit-vocabulary exclude each other."
             )
-        if not (self.checkpoint or self.extractor or self.rows or self.server):
+        if not (self.checkpoint or self.extractor or self.rows):
             raise InvalidRequest(
                 "no_model",
-                "Specify what to evaluate: --checkpoint F.ckpt, --extractor NAME, --rows "
-                "DATABASE.npy QUERIES.npy, or --server URL.",
+                "Specify what to evaluate: --checkpoint F.ckpt, --extractor NAME, or --rows "
+                "DATABASE.npy QUERIES.npy.",
             )
 
 
@@ -232,13 +91,6 @@ def evaluate_sets(
     `which_set`), Misconfigured (`out_unwritable`), and errors of opening sets and models.
     """
     target.check()
-    described = target.checkpoint or target.extractor or target.rows
-    if options.place_labels_are_paths and not described:
-        raise InvalidRequest(
-            "options_contradict",
-            "--place-labels-are-paths requires --checkpoint, --extractor or --rows: with --server, "
-            "levels are not measured. To measure those of a map: placewise evaluate --map NAME.",
-        )
     check_output_folders(options.out, options.pairs)
     settings = read_settings()
     set_names = names or evaluation_set_names(data)
@@ -268,13 +120,6 @@ def evaluate_sets(
                         evaluation_set, database, queries, options, settings, progress
                     )
                 run = EvaluationRun(target.rows[0].stem, None, {"rows": target.rows[0].name})
-            elif not described:
-                ranked, run, figures = _evaluate_server(
-                    evaluation_set, target, options.depth, progress
-                )
-                result = evaluate_rankings(
-                    evaluation_set, ranked, options, has_scores=True, about=figures
-                )
             else:
                 describer = make_describer(evaluation_set, target, settings, progress)
                 result = _evaluate_describer(evaluation_set, describer, options, settings, progress)

@@ -64,8 +64,8 @@ def locate(
     write: Annotated[
         Target | None,
         typer.Option(
-            help="Write the accepted proposals: XMP sidecars, EXIF, or a CSV table or GPX "
-            "waypoints in DIR. Without it, nothing is written."
+            help="Write the accepted proposals: XMP sidecars, or a CSV table in DIR. Without it, "
+            "nothing is written."
         ),
     ] = None,
     undo_changes: Annotated[
@@ -95,7 +95,7 @@ def locate(
         return
     options = LocateOptions(
         accept, radius, motion, together, gpx, picture, server, map_name, bool(write), as_json,
-        "--write sidecar, exif, csv or gpx", command_line("locate", folder, "--undo"), "files",
+        "--write sidecar or csv", command_line("locate", folder, "--undo"), "files",
     )  # fmt: skip
     if not locate_library(library, options, partial(connect, server, map_name, key)):
         raise typer.Exit(1)

@@ -40,39 +40,32 @@ class UndoJournal:
             (self._folder / name).mkdir(exist_ok=True)
         lines = _read_lines(self._journal)
         repair_journal(self._journal, lines)
-        self._read: dict[Path, str | None] = {}  # staged file -> SHA-256 of the file it is made of
         self._known: dict[str, set[str | None]] = {}  # path -> SHA-256 of what undo may discard
         for line in lines:
             self._remember(line)
 
-    def stage(self, path: Path, content: bytes | None = None) -> Path:
-        """Return a file for the new content of `path`: with this content, or a copy of the file."""
-        staged = self._folder / STAGED / path.name
-        staged.unlink(missing_ok=True)
-        if content is None:
-            shutil.copy2(path, staged)
-            self._read[staged] = _sha256(staged)
-        else:
-            self._read[staged] = _sha256(path)
-            staged.write_bytes(content)
-        return staged
+    def write(self, path: Path, content: bytes, existing: bytes | None) -> None:
+        """Replace `path` by this content.
 
-    def install(self, path: Path, staged: Path) -> None:
-        """Replace `path`, which may not exist yet, by a staged file.
+        Args:
+            existing: What the content was made of; None for a new file.
 
         Raises:
             Unprocessable: `outside_folder`, for a link to a file that is not below the folder;
                 `owner_differs`, if only another user can write a file with the same owner.
-            Conflict: `changed_meanwhile`, if another program changed the file since it was staged.
+            Conflict: `changed_meanwhile`, if the file is another than `existing` by now.
         """
         path = path.resolve()  # a link stays a link
         name = os.path.relpath(path, self._root)
         _check_is_below(self._root, name)
+        staged = self._folder / STAGED / path.name
+        staged.unlink(missing_ok=True)
+        staged.write_bytes(content)
         if path.exists():
             _copy_ownership(path, staged)
         _sync(staged)
         line = {"path": name, "before": _sha256(path), "after": _sha256(staged), "backup": None}
-        if line["before"] != self._read.pop(staged):
+        if line["before"] != (None if existing is None else hashlib.sha256(existing).hexdigest()):
             raise Conflict(
                 "changed_meanwhile", "Another program has changed the file meanwhile. Try again."
             )

@@ -14,7 +14,6 @@ import shutil
 import sys
 from collections.abc import Callable
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 
 from shared.catalog.database.schema import check_pages
@@ -22,6 +21,7 @@ from shared.catalog.tables import open_catalog
 from shared.config.private_files import is_open_to_others
 from shared.config.settings import Settings, memory_limit_bytes
 from shared.errors import Misconfigured
+from shared.telemetry.tracing import configure_tracing
 
 BYTES_PER_PARAMETER = 4  # float32
 # Twice the memory measured in the forward pass of ViT-g, the widest backbone, at 224 x 224 pixels:
@@ -154,21 +154,9 @@ def _check_versions(_: Settings) -> str:
 
 
 def _check_settings(settings: Settings) -> str:
-    """Report the settings; they are valid, or no check would run."""
-    if settings.otel_exporter_otlp_endpoint is not None and not _is_installed("opentelemetry.sdk"):
-        raise Misconfigured(
-            "otel_missing",
-            "OTEL_EXPORTER_OTLP_ENDPOINT is set, but the extra otel is not installed. Install it "
-            "(uv pip install '.[otel]') or unset the variable.",
-        )
-    return f"{len(settings.model_fields_set)} settings are set (placewise config lists all)"
-
-
-def _is_installed(package: str) -> bool:
-    try:
-        return find_spec(package) is not None
-    except ModuleNotFoundError:  # the parent package is missing
-        return False
+    """Report the settings, which are valid, or no check would run; Misconfigured as for tracing."""
+    with configure_tracing(settings, "doctor"):
+        return f"{len(settings.model_fields_set)} settings are set (placewise config lists all)"
 
 
 def _check_home(settings: Settings) -> str:

@@ -10,6 +10,7 @@ from uuid import UUID
 
 from sqlalchemy import select
 
+from services.cli.output import first_names
 from services.cli.recovery.backup import (
     BackedUpObject,
     BackupFolder,
@@ -124,9 +125,7 @@ def _copy_objects(
                 damaged.append(entry.key)
         progress("objects", done, len(index))
     if damaged:
-        names = ", ".join(damaged[:MAX_NAMES_IN_ERROR]) + (
-            " ..." if len(damaged) > MAX_NAMES_IN_ERROR else ""
-        )
+        names = first_names(damaged, MAX_NAMES_IN_ERROR)
         raise Misconfigured(
             "backup_damaged",
             f"{len(damaged)} objects of the backup are missing or damaged: {names}. Use another "

@@ -1,4 +1,4 @@
-"""Files of a track: JSON, CSV, GPX and GeoJSON, by the extension of their names."""
+"""Files of a track: CSV, GPX and GeoJSON, by the extension of their names."""
 
 from __future__ import annotations
 
@@ -76,10 +76,6 @@ def located_segments(track: OneTrack) -> list[list[LocatedFrame]]:
     return [list(group) for located, group in groups if located]
 
 
-def _to_json(track: OneTrack) -> bytes:
-    return json.dumps(track.as_json(), ensure_ascii=False, indent=2).encode()
-
-
 def _to_csv(track: OneTrack) -> bytes:
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
@@ -143,7 +139,6 @@ def _plain(value: Any) -> Any:
 
 
 WRITERS: dict[str, Callable[[OneTrack], bytes]] = {
-    ".json": _to_json,
     ".csv": _to_csv,
     ".gpx": _to_gpx,
     ".geojson": _to_geojson,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from shared.geometry.cameras import Camera, CameraSource, Floats
 from shared.geometry.component import Component, bounded_inverse, projection_jacobian
 from shared.geometry.frames import MIN_AGREEING_SHARE, Alignment, Similarity
-from shared.geometry.localise import LocalPose, localise
+from shared.geometry.localise import OTHER_LENS, LocalPose, localise
 from shared.geometry.radius import (
     NORMAL_95,
     PoseCalibration,
@@ -89,22 +89,45 @@ class ComponentPhotos:
     similarity: Similarity | None
     """of the component, if it is aligned"""
 
+    def is_camera_known(self, row: int) -> bool:
+        """Return whether a query of the same camera as a photo would get its camera."""
+        rays = self.component.cameras[self.component.camera_numbers[row]].rays
+        known = self.focal_lengths[row] if rays is None else any(rays.camera_key)
+        return bool(known)
+
+    def query_camera(self, row: int, knows_lens: bool) -> tuple[Camera | None, CameraSource]:
+        """Return what is known of the camera of a query with a photo's EXIF."""
+        camera = self.component.cameras[self.component.camera_numbers[row]]
+        features = self.features[self.component.photo_ids[row]]
+        size, focal_length = (features.width, features.height), self.focal_lengths[row]
+        if knows_lens:
+            return camera.resized(*size), CameraSource.MAP
+        if focal_length is None:
+            return None, CameraSource.ESTIMATED
+        return Camera.of_focal_length(*size, focal_length), CameraSource.EXIF
+
 
 def localise_left_out(
     photos: ComponentPhotos,
     matcher: Matcher,
     on_progress: Callable[[int], None],
     threads: int = min(os.cpu_count() or 1, 4),
+    *,
+    knows_lens: bool = False,
 ) -> list[LeftOutPose | None]:
     """Localise at most MAX_PHOTOS photos of a component without themselves; None without a pose.
 
     Args:
+        knows_lens: As queries of the photos' own cameras: photos whose camera the map would not
+            recognise are left out. Otherwise as queries of other cameras.
         on_progress: Called with the number of photos that are done; what it raises ends the work.
     """
     component, features, descriptors = photos.component, photos.features, photos.descriptors
     seconds = photos.seconds
     count = len(component.photo_ids)
     chosen = np.sort(np.random.default_rng(0).permutation(count)[:MAX_PHOTOS])
+    if knows_lens:
+        chosen = chosen[[photos.is_camera_known(row) for row in chosen]]
 
     def localise_one(row: int) -> LeftOutPose | None:
         near = np.abs(seconds - seconds[row]) <= NEIGHBOUR_SECONDS
@@ -112,13 +135,11 @@ def localise_left_out(
         similarities = np.where(near, -np.inf, descriptors @ descriptors[row])
         best = np.argsort(-similarities, kind="stable")[: min(CANDIDATES, int((~near).sum()))]
         photo = component.photo_ids[row]
-        camera, source = _query_camera(component, row, features[photo], photos.focal_lengths[row])
         found = localise(
-            _with_noise(component, row, features[photo]),
+            _as_another_photo(component, row, features[photo], by_another_lens=not knows_lens),
             [(component.photo_ids[i], features[component.photo_ids[i]]) for i in best.tolist()],
             [_without(component, np.flatnonzero(near), features)],
-            camera,
-            source,
+            *photos.query_camera(row, knows_lens),
             matcher,
             frozenset(component.photo_ids[i] for i in np.flatnonzero(near).tolist()),
         )
@@ -132,18 +153,6 @@ def localise_left_out(
             done.append(found)
             on_progress(len(done))
     return done
-
-
-def _query_camera(
-    component: Component, row: int, query: LocalFeatures, focal_length: float | None
-) -> tuple[Camera | None, CameraSource]:
-    """Return the camera that a query of the same camera as a photo would have."""
-    camera, size = component.cameras[component.camera_numbers[row]], (query.width, query.height)
-    if focal_length if camera.rays is None else any(camera.rays.camera_key):
-        return camera.resized(*size), CameraSource.MAP
-    if focal_length is None:
-        return None, CameraSource.ESTIMATED
-    return Camera.of_focal_length(*size, focal_length), CameraSource.EXIF
 
 
 def _errors(
@@ -164,21 +173,32 @@ def _errors(
     return numbers[is_point][is_known], errors[is_known] * scale
 
 
-def _with_noise(component: Component, row: int, features: LocalFeatures) -> LocalFeatures:
+def _as_another_photo(
+    component: Component, row: int, features: LocalFeatures, *, by_another_lens: bool
+) -> LocalFeatures:
     """Return a photo's features as those of another photo from the same place.
 
     The noise of its keypoints is in its pose in the model, too, and would cancel out. So each gets
-    another one of the same size.
+    another one of the same size. So would the errors of its lens, from which another one differs
+    by `OTHER_LENS`.
     """
+    random = np.random.default_rng(row)
+    size = features.width, features.height
+    camera = component.cameras[component.camera_numbers[row]].resized(*size)
     _, errors = _errors(component, row, features)
-    if not len(errors):
-        return features
-    longer = max(features.width, features.height)
-    noise = np.random.default_rng(row).normal(
-        0, np.sqrt(np.mean(errors**2)) * longer / WORKING_SIDE, features.positions.shape
-    )
-    positions = features.positions + noise * FULL_SIDE / (features.width, features.height)
-    return replace(features, positions=np.clip(np.round(positions), 0, FULL_SIDE).astype(np.uint16))
+    pixels, longer = features.pixels(), max(size)
+    if len(errors):
+        noise = np.sqrt(np.mean(errors**2)) * longer / WORKING_SIDE
+        pixels += random.normal(0, noise, pixels.shape)
+    if by_another_lens:
+        shift = random.normal(0, OTHER_LENS.principal_point * longer, 2)
+        offsets = camera.undistort(pixels) - np.array(size) / 2
+        squares = np.sum(offsets**2, axis=1, keepdims=True) / camera.focal_pixels**2
+        bent = 1 + random.normal(0, OTHER_LENS.radial) * squares
+        pixels = np.array(size) / 2 + bent * offsets + shift
+    is_seen = ((pixels >= 0) & (pixels <= size)).all(axis=1)
+    positions = np.round(pixels[is_seen] * FULL_SIDE / size).astype(np.uint16)
+    return replace(features, positions=positions, descriptors=features.descriptors[is_seen])
 
 
 def _without(
@@ -267,23 +287,28 @@ def _quantile(ratios: Floats, level: float, normal: float) -> float:
 
 
 def calibrate_components(
-    parts: Sequence[ComponentPhotos], matcher: Matcher, on_progress: Callable[[int], None]
+    parts: Sequence[ComponentPhotos], matcher: Matcher, on_progress: Callable[[float], None]
 ) -> list[PoseCalibration]:
-    """Calibrate the poses in each component.
+    """Calibrate the poses in each component, of queries by other lenses and by those of the map.
 
     Args:
-        on_progress: Called with the number of photos of all components that are done.
+        on_progress: Called with the share of the photos of all components that are done.
     """
-    found: list[PoseCalibration] = []
+    counts = [min(len(part.component.photo_ids), MAX_PHOTOS) for part in parts]
     done = 0
 
-    def report(count: int) -> None:
-        on_progress(done + count)
+    def report(of_part: int) -> None:
+        on_progress((done + of_part) / (2 * sum(counts)))
 
-    for part in parts:
-        poses = localise_left_out(part, matcher, report)
-        done += len(poses)
-        found.append(calibrate(poses))
+    found: list[PoseCalibration] = []
+    for part, count in zip(parts, counts, strict=True):
+        any_lens = calibrate(localise_left_out(part, matcher, report))
+        done += count
+        known = localise_left_out(part, matcher, report, knows_lens=True)
+        done += count
+        found.append(
+            any_lens.model_copy(update={"known_lens": calibrate(known) if known else None})
+        )
     return found
 
 

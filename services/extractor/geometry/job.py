@@ -27,7 +27,6 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from services.extractor.child_process import run_in_child
-from services.extractor.geometry.calibrate import MAX_PHOTOS as MAX_PHOTOS_LEFT_OUT
 from services.extractor.geometry.calibrate import (
     ComponentPhotos,
     CoordinateProposal,
@@ -424,10 +423,8 @@ class ReconstructionJob:
         alignments: list[Alignment | str],
         photos: dict[UUID, MapPhoto],
     ) -> list[PoseCalibration]:
-        total = sum(min(len(component.photo_ids), MAX_PHOTOS_LEFT_OUT) for component in components)
-
-        def report(done: int) -> None:
-            units = MAPPED + (PROGRESS_UNITS - MAPPED) * done // max(1, total)
+        def report(share: float) -> None:
+            units = MAPPED + int((PROGRESS_UNITS - MAPPED) * share)
             self._progress.update(units, "calibrate")
 
         parts = []

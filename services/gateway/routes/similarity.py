@@ -25,14 +25,7 @@ from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
 from services.gateway.json_bodies import JsonRoute
 from services.gateway.responses import JobAcceptedResponse
 from services.gateway.similarity.execute import find_similar, query_from_job, query_from_photo
-from services.gateway.similarity.geopose import (
-    GEOPOSE,
-    GeoPoseDep,
-    GeoPoseRequest,
-    GeoPoseResponse,
-    require_pose,
-    with_geopose,
-)
+from services.gateway.similarity.geopose import GeoPoseRequest, GeoPoseResponse
 from services.gateway.similarity.matches import check_matching_enabled
 from services.gateway.similarity.search_params import SearchParams, SimilarityParams
 from services.gateway.uploads.multipart import FormFile, multipart_schema
@@ -79,30 +72,23 @@ ERROR_BY_STATUS = {kind.status: kind for kind in (NotFound, Conflict, Gone)}
 @router.post(
     "/similarity/{file_id}",
     operation_id="similar_to_stored",
-    response_model=SimilarityResponse,
-    responses=GEOPOSE,
     dependencies=[READ],
 )
 def search_by_stored_photo(
     gateway: GatewayDep,
     file_id: Annotated[FileId, PathParameter(description="a stored photo")],
     query: Annotated[SimilarityParams, Query()],
-    geopose: GeoPoseDep,
-) -> Any:
-    """Find the photos most similar to a stored photo, without that photo.
-
-    With `Accept: application/geopose+json`, the response is the photo's pose as OGC GeoPose.
-    """
-    search_params = query.search_params(with_pose=geopose)
-    answer = find_similar(gateway, query_from_photo(gateway, query.map, file_id), search_params)
-    return with_geopose(answer, geopose)
+) -> SimilarityResponse:
+    """Find the photos most similar to a stored photo, without that photo."""
+    search_params = query.search_params()
+    return find_similar(gateway, query_from_photo(gateway, query.map, file_id), search_params)
 
 
 @router.post(
     "/similarity",
     operation_id="similar_to_upload",
     response_model=SimilarityResponse,
-    responses=JOB_PENDING | GEOPOSE,
+    responses=JOB_PENDING,
     openapi_extra=multipart_schema("the query photo"),
     dependencies=[READ, ADMIT_QUERY],
 )
@@ -113,16 +99,14 @@ async def search_by_uploaded_photo(
     idempotent: IdempotentFormDep,
     admission: AdmissionDep,
     query: Annotated[SimilarityParams, Query()],
-    geopose: GeoPoseDep,
 ) -> Any:
     """Find the photos most similar to an uploaded photo that is not stored.
 
     The response is 202 with a job: poll `status_url`, then GET `result_url`. With `Prefer: wait=N`
     it is 200 with the result if that takes at most N seconds. A request repeated with its
-    `Idempotency-Key` gets the 202 of the first one. With `Accept: application/geopose+json`, the
-    result is the photo's pose as OGC GeoPose.
+    `Idempotency-Key` gets the 202 of the first one.
     """
-    search_params = query.search_params(with_pose=geopose)
+    search_params = query.search_params()
     async with receive_query_photo(request, gateway, admission) as (job_id, file):
         job = await run_in_threadpool(
             _queue_query, gateway, query.map, job_id, file, search_params, idempotent
@@ -136,7 +120,7 @@ async def search_by_uploaded_photo(
         job = described
     if job.state in UNFINISHED_STATES:
         return JobAcceptedResponse.of(job, query.map).to_http(response.headers)
-    return await run_in_threadpool(_result_of, gateway, job, geopose)
+    return await run_in_threadpool(_result_of, gateway, job)
 
 
 @router.post(GEOPOSE_PATH, operation_id="geopose", dependencies=[READ, ADMIT_QUERY])
@@ -157,20 +141,17 @@ async def localise_by_geopose_protocol(
         raise Unavailable(
             "query_unfinished", f"The photo was not described within {wait:g} s. Send it again."
         )
-    answer = await run_in_threadpool(_answer_of, gateway, described)
-    return GeoPoseResponse.of(sent, require_pose(answer))
+    return GeoPoseResponse.of(sent, await run_in_threadpool(_result_of, gateway, described))
 
 
 @router.get(
     "/jobs/{job_id}/result",
     operation_id="similarity_result",
-    response_model=SimilarityResponse,
-    responses=GEOPOSE,
     dependencies=[READ],
 )
 def read_similarity_result(
-    gateway: GatewayDep, job_id: JobId, query: MapQuery, geopose: GeoPoseDep
-) -> Any:
+    gateway: GatewayDep, job_id: JobId, query: MapQuery
+) -> SimilarityResponse:
     """Get the result of a succeeded query job; 409 while it is unfinished."""
     with gateway.catalog.read() as session:
         job = get_job(session, get_map(session, query.map).id, job_id)
@@ -183,7 +164,7 @@ def read_similarity_result(
             job_id=str(job.id),
             state=job.state,
         )
-    return _result_of(gateway, job, geopose)
+    return _result_of(gateway, job)
 
 
 @router.get(
@@ -249,12 +230,7 @@ def _queue_geopose(gateway: GatewayContext, map_name: str, sent: GeoPoseRequest)
     return job
 
 
-def _result_of(gateway: GatewayContext, job: Job, geopose: bool) -> Any:
-    """The result of a finished query job, as GeoPose if that is accepted."""
-    return with_geopose(_answer_of(gateway, job), geopose)
-
-
-def _answer_of(gateway: GatewayContext, job: Job) -> SimilarityResponse:
+def _result_of(gateway: GatewayContext, job: Job) -> SimilarityResponse:
     """The answer of a finished query job."""
     if job.state == JobState.SUCCEEDED:
         search_params = query_job_search_params(job)

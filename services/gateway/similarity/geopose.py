@@ -1,4 +1,4 @@
-"""OGC GeoPose 1.0 (21-056r11) as a form of an answer, and the Open AR Cloud's requests for it.
+"""The Open AR Cloud's requests for a pose as OGC GeoPose 1.0 (21-056r11), and their answers.
 
 The outer frame is east, north, up at the camera. The inner frame has x in the viewing direction, y
 to the left and z up, as bodies in ROS have (REP 103), so a camera with yaw 0 looks east.
@@ -13,8 +13,6 @@ import base64
 import binascii
 from typing import Annotated, Any
 
-from fastapi import Depends, Request
-from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic.alias_generators import to_camel
 
@@ -28,8 +26,6 @@ from shared.responses import ResponseModel
 from shared.responses.similarity import CameraPoseResponse, SimilarityResponse
 from shared.search_api.photo_filter import Circle
 
-MEDIA_TYPE = "application/geopose+json"
-JSON_TYPE = "application/json"
 MAX_GEOPOSE_BYTES = 8_000_000
 """Of a request with a photo in base64, which takes a third more than the photo"""
 MAX_READINGS = 64
@@ -39,57 +35,6 @@ HINT_ACCURACIES = 2.0
 SAME_SHAPE = 0.02
 UNKNOWN_CAMERA = "UNKNOWN_CAMERA"
 Side = Annotated[int, Field(ge=1, le=1_000_000)]
-
-
-GEOPOSE: dict[int | str, dict[str, Any]] = {
-    200: {
-        "content": {
-            MEDIA_TYPE: {
-                "schema": {
-                    "type": "object",
-                    "required": ["position"],
-                    "description": "the pose as OGC GeoPose 1.0, Basic-Quaternion; 422 "
-                    "(`no_pose`) if there is none",
-                }
-            }
-        }
-    }
-}
-
-
-def _accepts_geopose(request: Request) -> bool:
-    """Whether the header `Accept` names GeoPose, and does not prefer JSON."""
-    qualities = {}
-    for accepted in request.headers.get("accept", "").lower().split(","):
-        name, *parameters = (part.strip() for part in accepted.split(";"))
-        values = dict(parameter.partition("=")[::2] for parameter in parameters)
-        try:
-            qualities[name] = float(values.get("q", 1))
-        except ValueError:
-            qualities[name] = 0.0
-    return qualities.get(MEDIA_TYPE, 0) > 0 and (
-        qualities[MEDIA_TYPE] >= qualities.get(JSON_TYPE, 0)
-    )
-
-
-GeoPoseDep = Annotated[bool, Depends(_accepts_geopose)]
-"""Whether the answer is to be a GeoPose."""
-
-
-def with_geopose(answer: SimilarityResponse, accepted: bool) -> Any:
-    """Return the answer, or its pose as GeoPose if that is accepted; raises as `require_pose`."""
-    if not accepted:
-        return answer
-    return JSONResponse(geopose(require_pose(answer)), media_type=MEDIA_TYPE)
-
-
-def require_pose(answer: SimilarityResponse) -> CameraPoseResponse:
-    """Return the pose of an answer; Unprocessable (`no_pose`) without one."""
-    if answer.pose is None:
-        raise Unprocessable(
-            "no_pose", answer.no_pose or "The query was sent without `pose=true`. Send it again."
-        )
-    return answer.pose
 
 
 def geopose(pose: CameraPoseResponse) -> dict[str, dict[str, float]]:
@@ -222,8 +167,11 @@ class GeoPoseResponse(ResponseModel):
     geopose: dict[str, dict[str, float]]
 
     @classmethod
-    def of(cls, request: GeoPoseRequest, pose: CameraPoseResponse) -> GeoPoseResponse:
-        """Return the response; raises as `geopose`."""
+    def of(cls, request: GeoPoseRequest, answer: SimilarityResponse) -> GeoPoseResponse:
+        """Return the response; Unprocessable (`no_pose`) without a pose, and as `geopose`."""
+        pose = answer.pose
+        if pose is None:
+            raise Unprocessable("no_pose", answer.no_pose or "The photo has no pose.")
         return cls(
             id=request.id,
             timestamp=request.timestamp,

@@ -226,8 +226,7 @@ class SearchParams(RankingParams):
 class SimilarityParams(RankingParams, FilterParams):
     """Query parameters of the similarity searches."""
 
-    def search_params(self, *, with_pose: bool = False) -> SearchParams:
-        """Parse the filter; raises as `photo_filter`. `with_pose` asks for the pose, too."""
+    def search_params(self) -> SearchParams:
+        """Parse the filter; raises as `photo_filter`."""
         ranking = self.model_dump(include=set(RankingParams.model_fields))
-        ranking["pose"] |= with_pose
         return SearchParams(photos=self.photo_filter(), **ranking)

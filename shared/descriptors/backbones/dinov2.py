@@ -121,6 +121,7 @@ class Dinov2(Backbone):
             "size_bytes": file.path.stat().st_size,
         }
         self._bfloat16_vit: Any = None
+        self._on_device: Any = None
         self._positions: dict[tuple[int, int], torch.Tensor] = {}
 
     @classmethod
@@ -175,14 +176,16 @@ class Dinov2(Backbone):
 
     def _vit_for_precision(self) -> Any:
         """Return the network for the current autocast; only the last one used is on the device."""
-        if not torch.is_autocast_enabled(self.device.type):
-            if self._bfloat16_vit is not None:
-                self._bfloat16_vit.cpu()
-            return self._vit.to(self.device)
-        if self._bfloat16_vit is None:
-            self._bfloat16_vit = copy_in_bfloat16(self._vit)
-        self._vit.cpu()
-        return self._bfloat16_vit.to(self.device)
+        vit, other = self._vit, self._bfloat16_vit
+        if torch.is_autocast_enabled(self.device.type):
+            vit, other = other or copy_in_bfloat16(vit), vit
+            self._bfloat16_vit = vit
+        if self._on_device is not vit:
+            self._on_device = None  # a move that runs out of memory leaves some tensors behind
+            if other is not None:
+                other.cpu()
+            self._on_device = vit.to(self.device)
+        return vit
 
     def _with_positions(
         self, vit: Any, patches: torch.Tensor, rows: int, columns: int

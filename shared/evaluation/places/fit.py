@@ -5,11 +5,11 @@ coefficients: a small map stays near them, a large one follows its own photos.
 
 The samples are the map's own photos, each searched without itself, and *impostors*: the same photos
 searched as if the map had no photo of a place that shows them. Levels are conditional on "in this
-map" and learn nothing from impostors: a query of another season looks as weak as they do, and is
-right. Labelled queries, if there are enough, refine the coefficients, with those of the own photos
-as the prior. Thresholds are chosen on predictions of samples that the model was not fitted on
-(cross-validation), where impostors have the total weight `UNMAPPED_SHARE`: that share of queries of
-places without a photo is assumed.
+map": they learn nothing from impostors, which look like queries of another season, and from a
+wrong sample as much as the map probably shows its place. Labelled queries, if there are enough,
+refine the coefficients, with those of the own photos as the prior. Thresholds are chosen on
+cross-validated predictions, where impostors have the total weight `UNMAPPED_SHARE`: that share of
+queries of places without a photo is assumed.
 
 An own photo that is alone at its place teaches nothing about "in the map": searched without itself,
 it is an impostor.
@@ -25,6 +25,7 @@ import numpy as np
 
 from shared.evaluation.places.levels import CandidateLevel, FloatArray, LevelScheme
 from shared.evaluation.places.probability import (
+    ELSEWHERE_SHARE,
     MIN_LABELLED_QUERIES,
     UNMAPPED_SHARE,
     Background,
@@ -135,21 +136,21 @@ def _fit_coefficients(
     scheme: LevelScheme,
     scores: MapScores,
 ) -> PlaceModel:
-    prior = shipped_prior()
+    prior, elsewhere = shipped_prior(), _fit_elsewhere(samples, scores)
     positions = max((len(sample.levels) for sample in [*samples, *labelled]), default=0)
     levels = []
     for position in range(positions):
-        own = _level_table([s for s in samples if s.left_out is None], position)
+        own = _level_table([s for s in samples if s.left_out is None], position, elsewhere)
         width = own.features.shape[-1] if len(own.target) else 0
         fitted = fit_map_estimate(own, prior.level_coefficients(width), precision=OWN_PRECISION)
-        levels.append(fit_map_estimate(_level_table(labelled, position), fitted))
+        levels.append(fit_map_estimate(_level_table(labelled, position, elsewhere), fitted))
     return PlaceModel(
         source="labelled_queries" if labelled else "own_photos",
         scheme=scheme,
         spread=scores.spread,
         levels=tuple(levels),
         missing_place=fit_map_estimate(missing_place_table(samples), prior.missing_place),
-        elsewhere=_fit_elsewhere(samples, scores),
+        elsewhere=elsewhere,
         extent=scores.extent,
         own_photos=sum(sample.left_out is None for sample in samples),
         labelled_queries=len(labelled),
@@ -178,9 +179,15 @@ class RegressionTable:
         )
 
 
-def _level_table(samples: Sequence[PlaceSample], position: int) -> RegressionTable:
+def _level_table(
+    samples: Sequence[PlaceSample], position: int, elsewhere: Elsewhere
+) -> RegressionTable:
+    def weight(sample: PlaceSample) -> float:
+        wrong = sample.is_right[position] is False
+        return 1 - wrong * elsewhere.probability(sample.levels, ELSEWHERE_SHARE)
+
     return RegressionTable.of_rows(
-        (sample.levels[position].features, right, 1.0)
+        (sample.levels[position].features, right, weight(sample))
         for sample in samples
         if position < len(sample.levels) and (right := sample.is_right[position]) is not None
     )

@@ -17,8 +17,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared.evaluation.places.levels import FloatArray
-
 CERTAINTIES = (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.97, 0.98, 0.99, 0.995)
 """Certainties with stored thresholds; a request uses that of the next higher one."""
 MAX_ERROR_FACTOR = 5.0  # of an answer's error probability over 1 - certainty
@@ -101,7 +99,8 @@ def choose_threshold(estimates: Sequence[HeldOutEstimate], certainty: float) -> 
             known[row, position] = 0.0 if right is None else estimate.weight
             wrong[row, position] = estimate.weight if right is False else 0.0
     floor = max(0.5, 1 - MAX_ERROR_FACTOR * (1 - certainty))
-    for candidate in _candidates(probabilities[probabilities >= floor]):
+    distinct = np.unique(probabilities[probabilities >= floor])
+    for candidate in distinct[:: max(1, -(-len(distinct) // CANDIDATES))]:
         reached = probabilities >= candidate
         answered = np.flatnonzero(reached.any(axis=1))
         position = reached.argmax(axis=1)[answered]
@@ -110,9 +109,3 @@ def choose_threshold(estimates: Sequence[HeldOutEstimate], certainty: float) -> 
         if error <= 1 - certainty + 1e-9:
             return float(candidate)
     return certainty
-
-
-def _candidates(probabilities: FloatArray) -> FloatArray:
-    """Return at most CANDIDATES of the probabilities, lowest first."""
-    distinct = np.unique(probabilities)
-    return distinct[:: max(1, -(-len(distinct) // CANDIDATES))]

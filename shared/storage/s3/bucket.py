@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from email.utils import parsedate_to_datetime
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 from xml.etree.ElementTree import ParseError
 
 import urllib3
@@ -103,6 +103,10 @@ class Bucket:
     credentials: Credentials
     public: BaseURL
     """The server's URL for clients of Placewise."""
+    settings: Settings
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Bucket.from_settings, (self.settings,)  # decoders get it with connections of its own
 
     @classmethod
     def from_settings(cls, settings: Settings) -> Bucket:
@@ -150,6 +154,7 @@ class Bucket:
             settings.s3_region,
             credentials.retrieve(),
             BaseURL(public, settings.s3_region),
+            settings,
         )
 
     @contextlib.contextmanager

@@ -16,6 +16,7 @@ from PIL.ExifTags import IFD, Base
 from services.cli.immich import api
 from services.cli.immich.library import ImmichLibrary
 from services.cli.locate.library import LibraryPhoto, LocatedPhoto, PhotoLibrary
+from services.cli.locate.sidecars import add_position
 from services.cli.locate.undo_journal import FOLDER
 from services.cli.locate.writers import FolderLibrary, Target
 from shared.errors import Conflict, NotFound, Unprocessable
@@ -51,7 +52,7 @@ class FolderCase(Case):
         self.folder.mkdir()
         self.journal = self.folder / FOLDER / "journal.jsonl"
         self.lock = self.journal.with_name("lock")
-        self.library = FolderLibrary(self.folder, Target.EXIF)
+        self.library = FolderLibrary(self.folder, Target.SIDECAR)
 
     def add(self, number: int, seconds: float, position: tuple[float, float] | None) -> str:
         exif = exif_with_position(*position) if position else Image.Exif()
@@ -64,8 +65,7 @@ class FolderCase(Case):
         return f"IMG_{number}.jpg"
 
     def place(self, name: str, position: tuple[float, float]) -> None:
-        exif = exif_with_position(*position)
-        (self.folder / name).write_bytes(encoded(photo_image(99), "JPEG", exif=exif))
+        (self.folder / f"{name}.xmp").write_bytes(add_position(None, *position, 5.0))
 
     def delete(self, name: str) -> None:
         (self.folder / name).unlink()
@@ -186,10 +186,11 @@ def test_undo_leaves_what_was_changed_since_alone_and_names_it(case: Case) -> No
     case.library.write([proposed(photos[name]) for name in names])
     case.place(names[0], HERE)
     undone = case.library.undo()
-    assert (undone.changed_since, len(undone.restored + undone.removed)) == ([names[0]], 1)
+    assert [each.removesuffix(".xmp") for each in undone.changed_since] == names[:1]
+    assert len(undone.restored + undone.removed) == 1
     assert listed(case)[names[0]].latitude == pytest.approx(HERE[0], abs=1e-5)
     assert listed(case)[names[1]].is_unlocated
-    assert case.library.undo().changed_since == [names[0]], "the journal stays"
+    assert case.library.undo().changed_since == undone.changed_since, "the journal stays"
 
 
 def test_undo_restores_the_state_before_several_writes(case: Case) -> None:

@@ -57,7 +57,7 @@ def test_answer_whose_body_is_cut_is_no_answer(
             answer, code = _outcome(call, S3Store(Bucket.from_settings(settings)))
         codes.append(code)
         came = came + 1 if code is None and answer == right else 0
-        if came == 3 and place > body_bytes + 100:
+        if came >= 3 and place > body_bytes + 100:
             break
     assert came >= 3
     assert set(codes) == {"object_store_unavailable", None}

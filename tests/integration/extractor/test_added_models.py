@@ -496,18 +496,16 @@ def test_patches_of_an_exported_network_get_a_vocabulary_of_the_map(
 
 
 @pytest.mark.parametrize(
-    ("data", "file", "options", "code"),
+    ("data", "file", "code"),
     [
-        (b"no network", "net.onnx", SIZE, "model_unusable"),
-        (tiny_torchscript(), "net.pt", "input.size=32x32", "model_unusable"),
-        (tiny_torchscript(), "net.pt", f"aggregator=vlad,{SIZE}", "model_unusable"),
-        (tiny_torchscript()[:-400], "net.pt", SIZE, "checkpoint_unreadable"),
+        (b"no network", "net.onnx", "model_unusable"),
+        (tiny_torchscript()[:-400], "net.pt", "checkpoint_unreadable"),
     ],
 )
 def test_a_file_that_is_no_network_for_photos_fails_and_leaves_nothing(
-    allowing: Service, data: bytes, file: str, options: str, code: str
+    allowing: Service, data: bytes, file: str, code: str
 ) -> None:
-    failed(allowing, send_exported(allowing, data, file, options=options), code)
+    failed(allowing, send_exported(allowing, data, file), code)
     assert keys(allowing, MODELS) == []
     assert allowing.json("GET", "/models")["models"] == []
 

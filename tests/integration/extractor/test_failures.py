@@ -243,24 +243,22 @@ def test_a_photo_deleted_before_it_is_read_is_not_described(averages: Harness) -
     assert averages.job(job_id).state == JobState.CANCELLED
 
 
-@pytest.mark.parametrize("failing", ["open", "writer"])
+@pytest.mark.parametrize("failing", ["", ".partial"])
 def test_jobs_pause_while_the_object_store_is_unreachable_and_no_attempt_is_counted(
-    averages: Harness, monkeypatch: pytest.MonkeyPatch, failing: str
+    averages: Harness, failing: str
 ) -> None:
+    folder, kept = averages.store.root / failing, averages.store.root.with_name("kept")
     photo_ids = averages.upload(1, 2)
     query = averages.ask(photo_bytes(3))
     jobs = [*(averages.job_of(photo_id).id for photo_id in photo_ids), query]
-
-    def away(*_: Any) -> None:
-        raise OSError("the disk is not there")
-
     for _ in range(MAX_ATTEMPTS + 1):
-        with monkeypatch.context() as patched:
-            patched.setattr(FolderStore, failing, away)
-            assert averages.drain()
+        folder.rename(kept)
+        folder.symlink_to(folder)  # each access is an OSError, also that of a decoder
+        assert averages.drain()
+        folder.unlink()
+        kept.rename(folder)
         assert averages.ended() == (0, 0)
-        for job_id in jobs:
-            job = averages.job(job_id)
+        for job in map(averages.job, jobs):
             assert (job.state, job.attempts, job.alone) == (JobState.QUEUED, 0, False)
             assert job.run_after is not None
         assert not averages.drain()  # they pause

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -34,10 +35,12 @@ class Gate:
         self.open = threading.Event()
         self.waiting = threading.Event()
         self.seen: list[str] = []
+        self.niceness: dict[int, int] = {}
         describe = Extractor.describe
 
         def described(made: Extractor, pixels: Any, *made_with: Any) -> Any:
             self.seen.append(f"describe {len(pixels)}")
+            self.niceness[len(pixels)] = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
             return describe(made, pixels, *made_with)
 
         def published(context: Any, batch: Any, *more: Any) -> None:
@@ -121,6 +124,7 @@ def test_query_is_published_at_once_while_bulk_batches_wait_to_be(
     job_id = averages.ask(photo_bytes(99))
     assert averages.await_end(job_id) == JobState.SUCCEEDED
     assert "published 4" not in gate.seen
+    assert gate.niceness[1] < gate.niceness[BATCH], "the query gets more of the processors"
     gate.open.set()
     draining.join()
     assert len(averages.rows()) == 2 * BATCH + 1

@@ -107,8 +107,18 @@ def walk(service: Service, scene: ReconstructedScene) -> Walk:
     return walk
 
 
-def test_photos_are_reconstructed_and_aligned_to_their_coordinates(walk: Walk) -> None:
+def test_photos_are_reconstructed_aligned_to_their_coordinates_and_counted(walk: Walk) -> None:
     made = walk.reconstruct()
+    assert walk.job(made.job_id).result == {
+        "reconstruction_id": str(made.id),
+        "photos": PHOTOS - 2,
+        "reconstructed": PHOTOS - 2,
+        "left_out": 0,
+        "left_out_names": [],
+        "components": 1,
+        "aligned": 1,
+        "proposals": 0,
+    }
     (component,) = made.list_components()
     assert (component.photos, made.imported, made.features_model) == (PHOTOS - 2, False, MODEL)
     assert component.points > 100
@@ -118,6 +128,9 @@ def test_photos_are_reconstructed_and_aligned_to_their_coordinates(walk: Walk) -
     assert alignment is not None
     assert alignment.rms_m < 0.1
     assert (alignment.agreeing, alignment.located) == (PHOTOS - 2, PHOTOS - 2)
+    calibration = PoseCalibration.model_validate(component.calibration)
+    assert calibration.poses >= 4
+    assert calibration.share_found == pytest.approx(calibration.poses / (PHOTOS - 2))
     found = walk.component(made)
     origin, similarity = (
         EastNorthUp(*alignment.origin),
@@ -136,21 +149,6 @@ def test_photos_are_reconstructed_and_aligned_to_their_coordinates(walk: Walk) -
     # The npz, and cameras, images, points, rigs and frames of COLMAP.
     assert report.checked["reconstruction"] == 6
     assert "reconstruction" not in {fault.what for fault in report.faults}
-
-
-def test_result_counts_photos_and_components(walk: Walk) -> None:
-    made = walk.reconstruct()
-    result = walk.job(made.job_id).result
-    assert result == {
-        "reconstruction_id": str(made.id),
-        "photos": PHOTOS - 2,
-        "reconstructed": PHOTOS - 2,
-        "left_out": 0,
-        "left_out_names": [],
-        "components": 1,
-        "aligned": 1,
-        "proposals": 0,
-    }
 
 
 def test_component_without_coordinates_says_why_it_is_not_aligned(walk: Walk) -> None:
@@ -185,13 +183,6 @@ def test_photo_with_wrong_coordinates_gets_a_proposal_and_nothing_is_changed(
     assert proposal["distance_m"] == pytest.approx(111, abs=1)
     unchanged = service.json("GET", f"/uploads/{walk.ids[2]}")
     assert (unchanged["latitude"], unchanged["longitude"]) == wrong
-
-
-def test_calibration_counts_the_photos_that_were_found_without_themselves(walk: Walk) -> None:
-    (component,) = walk.reconstruct().list_components()
-    calibration = PoseCalibration.model_validate(component.calibration)
-    assert calibration.poses >= 4
-    assert calibration.share_found == pytest.approx(calibration.poses / (PHOTOS - 2))
 
 
 def test_later_run_registers_new_photos_with_what_is_known_of_the_others(

@@ -15,18 +15,17 @@ import numpy as np
 import pytest
 from PIL import Image
 from PIL.ExifTags import IFD, Base
-from scipy.spatial.transform import Rotation
 
 from services.gateway.routes import similarity
 from services.gateway.similarity import pose as similarity_pose
-from services.gateway.similarity.geopose import MEDIA_TYPE
+from services.gateway.similarity.geopose import geopose
 from shared.catalog.chunks import Chunk
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map, Matching
 from shared.catalog.photos import Photo
 from shared.catalog.reconstructions import ReconstructedComponent
 from shared.catalog.tracks import TrackFrame
-from shared.errors import NotFound, Unavailable
+from shared.errors import NotFound, Unavailable, Unprocessable
 from shared.evaluation.places.probability import (
     Background,
     Elsewhere,
@@ -36,6 +35,7 @@ from shared.evaluation.places.probability import (
 from shared.geodesy import distance_m
 from shared.jobs import Job
 from shared.matching.features import FULL_SIDE, LocalFeatures
+from shared.responses.similarity import CameraPoseResponse
 from shared.search_api.protocol import PoseRequest, PoseResponse
 from shared.storage.keys import query_features_key
 from tests.integration.in_process_api import Service
@@ -186,9 +186,8 @@ def test_component_without_coordinates_gives_a_pose_in_its_frame_and_the_reason(
     assert reason in pose["reason"]
     assert {pose[name] for name in ("latitude", "longitude", "radius_68_m", "heading")} == {None}
     assert np.linalg.norm(np.array(pose["position"]) - CENTRE) < 0.2
-    headers = {"Accept": MEDIA_TYPE}
-    answer = service("POST", f"/similarity/{ids[0]}", headers=headers)
-    assert reason in problem(answer, 422, "no_pose")["detail"]
+    with pytest.raises(Unprocessable, match=reason):
+        geopose(CameraPoseResponse(**pose))
 
 
 def look_elsewhere(service: Service, place: dict[Any, Any]) -> None:
@@ -275,37 +274,10 @@ def test_query_without_a_pose_is_answered_with_the_reason(
     assert len(answer["similar_images"]) == (1 if params else len(ids))
 
 
-def test_geopose_is_an_answer_of_each_way_to_ask(
+def test_a_query_with_a_pose_gets_local_features_where_there_is_a_reconstruction(
     service: Service, scene: ReconstructedScene, ids: list[str]
 ) -> None:
-    reconstruct(service, scene, ids)
-    accept = {"Accept": f"{MEDIA_TYPE}; version=1.0, */*;q=0.1"}
-    place = ORIGIN.to_geographic(SIMILARITY.apply(CENTRE))
-    job_id = described(service, take_query(scene), pose="true")
-    answer = service("GET", f"/jobs/{job_id}/result", headers=accept)
-    assert answer.headers["Content-Type"] == MEDIA_TYPE
-    assert answer.json()["position"] == pytest.approx(
-        {"lat": place.latitude, "lon": place.longitude, "h": place.altitude_m}, abs=0.1
-    )
-    turn = Rotation.from_quat([answer.json()["quaternion"][axis] for axis in "xyzw"])
-    yaw_pitch_roll = (90 - HEADING + TURN_DEGREES, 0, 0)
-    assert turn.as_euler("ZYX", degrees=True) == pytest.approx(yaw_pitch_roll, abs=1)
-    stored = service.json("POST", f"/similarity/{ids[1]}", headers=accept)
-    assert stored.keys() == {"position", "quaternion"}
-    unposed = described(service, take_query(scene), pose="false")
-    answer = service("GET", f"/jobs/{unposed}/result", headers=accept)
-    assert "pose=true" in problem(answer, 422, "no_pose")["detail"]
-    preferred = {"Accept": f"application/json, {MEDIA_TYPE};q=0.5"}
-    plain = service.json("POST", f"/similarity/{ids[1]}", headers=preferred)
-    assert "similar_images" in plain
-
-
-def test_a_query_that_accepts_geopose_gets_local_features_where_there_is_a_reconstruction(
-    service: Service, scene: ReconstructedScene, ids: list[str]
-) -> None:
-    accept = {"Accept": MEDIA_TYPE}
-    plain: dict[str, str] = {}
-    for headers, is_reconstructed in ((accept, False), (plain, True), (accept, True)):
+    for with_pose, is_reconstructed in ((True, False), (False, True), (True, True)):
         if is_reconstructed:
             reconstruct(service, scene, ids)
         started = service.json(
@@ -313,10 +285,10 @@ def test_a_query_that_accepts_geopose_gets_local_features_where_there_is_a_recon
             "/similarity",
             202,
             files={"file": ("query.jpg", photo_bytes(0))},
-            headers=headers,
+            params={"pose": with_pose},
         )
         service.drain()
-        has_features = headers and is_reconstructed
+        has_features = with_pose and is_reconstructed
         with contextlib.nullcontext() if has_features else pytest.raises(NotFound):
             service.store.get(query_features_key(UUID(started["job_id"])))
 
@@ -468,6 +440,7 @@ def test_photos_at_the_hint_are_the_first_candidates_of_a_pose(
     assert set(candidates) == set(ids)
 
 
+@pytest.mark.usefixtures("describe_queries")
 def test_pose_without_a_height_is_no_geopose(
     service: Service, scene: ReconstructedScene, ids: list[str]
 ) -> None:
@@ -475,7 +448,7 @@ def test_pose_without_a_height_is_no_geopose(
     reconstruct(service, scene, ids, alignment=unknown)
     path = f"/similarity/{ids[0]}"
     assert service.json("POST", path, params={"pose": "true"})["pose"]["altitude_m"] is None
-    answer = service("POST", path, headers={"Accept": MEDIA_TYPE})
+    answer = service("POST", "/geopose", json=geopose_request(2))
     assert "no height" in problem(answer, 422, "no_pose")["detail"]
 
 

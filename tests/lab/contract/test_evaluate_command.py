@@ -196,8 +196,8 @@ def test_an_evaluation_writes_figures_rankings_and_a_report_that_fetches_nothing
     ]
     assert town.fingerprint in text
     assert "Levels of places" in text
-    paths = ["--server", "http://x", "--place-labels-are-paths"]
-    assert run_json("evaluate", "--data", city, *paths, code=1)["code"] == "options_contradict"
+    of_a_map = ["--data", city, "--extractor", "test-tiny-avg", "--map", "town"]
+    assert run_json("evaluate", *of_a_map, code=1)["code"] == "options_contradict"
 
 
 def test_a_ground_truth_file_replaces_that_of_a_set(

@@ -77,8 +77,8 @@ def _default_extractor(monkeypatch: pytest.MonkeyPatch) -> None:
 def cities(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("cities")
     return [
-        generated_city(folder / "rows", 71, places=26, views=2),
-        generated_city(folder / "yards", 72, places=52, views=1),
+        generated_city(folder / "rows", 71, places=16, views=2),
+        generated_city(folder / "yards", 72, places=32, views=1),
     ]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -95,12 +96,17 @@ def test_half_precision_computes_otherwise_and_comes_near(
     assert float((single * half).sum(dim=-1).mean()) >= LEAST_PATCH_COSINE
 
 
-def test_half_precision_leaves_the_single_precision_network_as_it_is(
-    networks: dict[Precision, Extractor],
+def test_a_move_back_to_the_device_that_fails_is_repeated_and_its_network_is_as_before(
+    networks: dict[Precision, Extractor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = networks["float32"].features(pixels(1))
     networks["bfloat16"].features(pixels(1))
-    assert torch.equal(networks["float32"].features(pixels(1)), before)
+    vit = networks["float32"].backbone._vit  # type: ignore[attr-defined]
+    monkeypatch.setattr(vit, "to", moving := Mock(side_effect=[torch.OutOfMemoryError(), vit]))
+    with pytest.raises(torch.OutOfMemoryError):
+        networks["float32"].features(pixels(1))
+    assert all(torch.equal(networks["float32"].features(pixels(1)), before) for _ in range(2))
+    assert moving.call_count == 2
 
 
 def test_half_precision_converts_no_matrix_and_scales_no_branch_in_a_pass(

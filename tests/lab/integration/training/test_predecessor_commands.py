@@ -17,7 +17,7 @@ from tests.lab.training_runs import PUBLISHED_COMMAND, write_tiny_places
 
 REPOSITORY = Path(__file__).parents[4]
 # What the small data and a machine without a GPU need; all other arguments are as published.
-HERE = ["--accelerator", "cpu", "--num_workers", "0", "--max_epochs", "1"]
+HERE = ["--accelerator", "cpu", "--num_workers", "0", "--max_epochs", "1", "--image_size", "64"]
 
 
 @pytest.fixture(autouse=True)
@@ -81,7 +81,7 @@ def test_the_published_grid_without_weights_ends_with_a_leaderboard_of_28_failed
     data: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = str(REPOSITORY / "configs" / "predecessor-grid.yaml")
-    small = [file, *data, *HERE, "--image_size", "64", "--out", str(tmp_path / "grid")]
+    small = [file, *data, *HERE, "--out", str(tmp_path / "grid")]
     command("grid", *small, "--dry-run")
     without_gpu = [*small, "--accelerator", "gpu"]
     found = command("grid", *without_gpu, "--dry-run", code=1)
@@ -108,7 +108,6 @@ def test_a_run_of_the_published_grid_is_trained_and_tested(data: list[str], tmp_
     grid["runs"] = [run for run in grid["runs"] if run["name"].startswith("26-")]
     file = tmp_path / "one.yaml"
     file.write_text(yaml.safe_dump(grid))
-    tokens = [str(file), *data, *HERE, "--image_size", "64", "--out", str(tmp_path / "grid")]
-    command("grid", *tokens)
+    command("grid", str(file), *data, *HERE, "--out", str(tmp_path / "grid"))
     metrics = next((tmp_path / "grid").glob("26-*/metrics.json"))
     assert set(json.loads(metrics.read_text())["test"]) == {"sfxs_test", "tokyoxs_test"}

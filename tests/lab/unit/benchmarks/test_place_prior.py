@@ -13,13 +13,12 @@ from shared.evaluation.places.probability import shipped_prior
 pytestmark = pytest.mark.numerics
 
 
-def test_one_in_twenty_photos_of_each_set_passes_and_a_feature_that_misleads_has_no_weight() -> (
-    None
-):
+@pytest.mark.parametrize("features", [2, 3])
+def test_one_in_twenty_of_each_set_passes_and_what_misleads_has_no_weight(features: int) -> None:
     """The second feature is larger for photos of elsewhere; one set is harder than the others."""
-    rng = np.random.default_rng(0)
-    means = {QUERIES: (8, 0), "easy": (1, 2), "hard": (3, 2), "other": (1, 2)}
-    maps = [{name: rng.normal(mean, 1, (60, 2)) for name, mean in means.items()} for _ in range(3)]
+    rng, size = np.random.default_rng(0), (60, features)
+    means = {QUERIES: (8, 0, 4), "easy": (1, 2, 1), "hard": (3, 2, 1), "other": (1, 2, 1)}
+    maps = [{k: rng.normal(m[:features], 1, size) for k, m in means.items()} for _ in range(3)]
     intercept, *slopes = fit_elsewhere([(str(n), each) for n, each in enumerate(maps)])
     assert slopes[0] < 0 == slopes[1]
     passing = {

@@ -1,4 +1,4 @@
-"""`placewise datasets check`, `ground-truth` and `audit` as people and programs call them."""
+"""`placewise datasets check` and `ground-truth` as people and programs call them."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ from services.cli.main import build_app
 from tests.lab.unit.data_sets import save_lists, save_names, utm_name, write_csv, write_photos
 
 
-def run(*arguments: object, code: int = 0) -> Result:
-    command = ["datasets", *map(str, arguments)]
-    result = CliRunner().invoke(build_app(["datasets"]), command)
+def run(*arguments: object, command: str = "datasets", code: int = 0) -> Result:
+    result = CliRunner().invoke(build_app([command]), [command, *map(str, arguments)])
     assert result.exit_code == code, result.output
     return result
 
@@ -29,6 +28,10 @@ def called(*arguments: object, code: int = 0) -> str:
 def run_datasets(*arguments: object, code: int = 0) -> Any:
     """The answer as a program gets it."""
     return json.loads(run(*arguments, "--json", code=code).stdout)
+
+
+def evaluate(*arguments: object, code: int = 0) -> Any:
+    return json.loads(run(*arguments, "--json", command="evaluate", code=code).stdout)
 
 
 def street(base: Path, folder: str, metres: list[float]) -> list[str]:
@@ -153,17 +156,14 @@ def test_ground_truth_by_another_rule_and_what_it_refuses(tmp_path: Path) -> Non
     assert run_datasets(*lists, missing, "--rule", "frames 2", code=1)["code"] == "out_unwritable"
 
 
-def test_audit_lists_confident_answers_just_outside_the_rule(tmp_path: Path) -> None:
+def test_an_evaluation_lists_first_matches_just_outside_the_rule(tmp_path: Path) -> None:
     street(tmp_path, "database", [0, 60, 1000])
     street(tmp_path, "queries", [0, 10])
     np.save(tmp_path / "p.npy", np.array([[1], [2]]))
-    np.save(tmp_path / "s.npy", np.array([[0.9], [0.8]]))
-    options = ("audit", tmp_path, "--predictions", tmp_path / "p.npy")
-    (suspect,) = run_datasets(*options, "--scores", tmp_path / "s.npy")["suspects"]
+    options = ("--data", tmp_path, "--predictions", tmp_path / "p.npy")
+    (suspect,) = evaluate(*options)["suspects"]
     assert (suspect["query"], suspect["metres"], suspect["database"]) == (0, 60.0, 1)
-    assert suspect["score"] == pytest.approx(0.9)
-    assert "1 of 2 queries" in called(*options)
     np.save(tmp_path / "p.npy", np.array([[1], [3]]))
-    assert run_datasets(*options, code=1)["code"] == "bad_predictions"
+    assert evaluate(*options, code=1)["code"] == "bad_predictions"
     np.save(tmp_path / "p.npy", np.array([0.5]))
-    assert run_datasets(*options, code=1)["code"] == "bad_predictions"
+    assert evaluate(*options, code=1)["code"] == "bad_predictions"

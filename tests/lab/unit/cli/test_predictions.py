@@ -64,7 +64,7 @@ def test_recall_is_reported_at_the_requested_numbers_of_photos(files: tuple[Path
         (np.array([[0], [1], [2], [-1], [3]]), "bad_predictions", "-1 of query 3"),
         (np.zeros((5, 5), np.float32), "bad_predictions", "float32"),
         (np.zeros(5, np.int64), "bad_predictions", "(5,)"),
-        (np.array([[1], ["two"]], object), "predictions_unreadable", "pickle"),
+        (np.array([[1], ["two"]], object), "bad_predictions", "Python objects"),
     ],
 )
 def test_file_that_is_no_predictions_of_these_queries_is_refused(
@@ -76,7 +76,7 @@ def test_file_that_is_no_predictions_of_these_queries_is_refused(
     assert message in problem["detail"]
     (tmp_path / "bad.npy").write_text("4 1 2")
     problem = run("--predictions", tmp_path / "bad.npy", "--ground-truth", files[1], code=1)
-    assert problem["code"] == "predictions_unreadable"
+    assert problem["code"] == "bad_predictions"
 
 
 def lists(folder: Path) -> list[object]:

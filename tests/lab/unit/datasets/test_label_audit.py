@@ -32,13 +32,11 @@ def evaluation(
 DATABASE = [at(metres, f"d{metres}") for metres in (0, 30, 100, 101, 1000)]
 
 
-def suspects_of(
-    ranked: list[int], scores: list[float] | None = None, **options: float
-) -> list[tuple[int, str]]:
+def suspects_of(ranked: list[int], scores: list[float] | None = None) -> list[tuple[int, str]]:
     """All queries stand at 0 m; the suspects' queries and first matches."""
     street = evaluation("radius 25 m", DATABASE, [at(0, f"q{n}") for n in range(len(ranked))])
     given = None if scores is None else np.array(scores, np.float32)[:, None]
-    found = find_suspect_labels(street, np.array(ranked, np.int64)[:, None], given, **options)
+    found = find_suspect_labels(street, np.array(ranked, np.int64)[:, None], given)
     return [(one.query, one.database_name) for one in found]
 
 
@@ -49,7 +47,6 @@ def test_wrong_first_match_up_to_four_times_the_radius_is_a_suspect() -> None:
 def test_only_matches_as_confident_as_the_median_right_one_count_most_confident_first() -> None:
     ranked, scores = [0, 0, 0, 1, 1, 1], [0.9, 0.7, 0.5, 0.8, 0.69, 0.95]
     assert suspects_of(ranked, scores) == [(5, "d30"), (3, "d30")]
-    assert suspects_of(ranked, scores, min_score=0.9) == [(5, "d30")]
     assert suspects_of([1, 1], [0.1, 0.2]) == [(1, "d30"), (0, "d30")]  # none is right: all count
 
 

@@ -9,25 +9,22 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 from urllib.parse import parse_qs, urlsplit
-from xml.etree import ElementTree
 
 import pyexiv2
 import pytest
 from PIL import Image
-from PIL.ExifTags import GPS, IFD, Base
+from PIL.ExifTags import IFD, Base
 from typer.testing import CliRunner, Result
 
 from services.cli.locate import preview, undo_journal, writers
 from services.cli.locate.folder import read_folder, read_gpx
-from services.cli.locate.sidecars import add_position
+from services.cli.locate.sidecars import EMPTY_SIDECAR, add_position
 from services.cli.main import build_app
 from shared.errors import InvalidRequest
-from shared.imaging.photo_header import read_photo_header
 from shared.ingest.photo_metadata import read_csv_manifest
 from tests.support.api_responses import PHOTO, POSE, SIMILAR, STATS
 from tests.support.fake_server import FakeServer
@@ -161,11 +158,10 @@ def test_a_photo_whose_gps_tag_is_not_understood_is_named_and_never_written(fold
         image.modify_exif({"Exif.GPSInfo.GPSLatitude": "45/1 4/1 12/1"})
     (folder / "4.jpg.xmp").write_bytes(b"no XML")
     before = contents(folder)
-    for target in ("exif", "sidecar"):
-        result = run(folder, "--together", "--write", target)
-        assert "day 1/2.jpg: its latitude has no letter N or S" in result.stderr
-        assert "4.jpg: its XMP is damaged" in result.stderr
-        assert before.items() <= contents(folder).items()
+    result = run(folder, "--together", "--write", "sidecar")
+    assert "day 1/2.jpg: its latitude has no letter N or S" in result.stderr
+    assert "4.jpg: its XMP is damaged" in result.stderr
+    assert before.items() <= contents(folder).items()
     as_json = json.loads(run(folder, "--json").stdout)
     assert (as_json["with_coordinates"], as_json["proposals"]) == (2, [])
     assert [each["filename"] for each in as_json["not_understood"]] == ["4.jpg", "day 1/2.jpg"]
@@ -200,32 +196,11 @@ def test_proposals_are_listed_and_nothing_is_written_unless_it_is_requested(fold
     assert rows[2][3:] == ["100 m", rows[2][4], "taken 20 s after 1.jpg"]
 
 
-@pytest.mark.parametrize("latitude", [LATITUDE, -LATITUDE])
-def test_exif_is_written_into_the_photo_and_undone(folder: Path, latitude: float) -> None:
-    for path, north in ((folder / "1.jpg", 0.0), (folder / "3.jpg", 40.0)):
-        path.with_suffix(".jpg.xmp").write_bytes(
-            add_position(None, latitude + north * DEGREES_PER_M, -LONGITUDE, 5.0)
-        )
-        path.write_bytes(photo(north))
-    before = contents(folder)
-    pixels = Image.open(folder / "day 1" / "2.jpg").tobytes()
-    written = run(folder, "--write", "exif")
-    assert written.exit_code == 0, written.output
-    with (folder / "day 1" / "2.jpg").open("rb") as file:
-        header = read_photo_header(file, 10**9)
-    assert (header.latitude, header.longitude) == pytest.approx(
-        (latitude + 20 * DEGREES_PER_M, -LONGITUDE), abs=1e-5
-    )
-    assert header.captured_at == NOON + timedelta(seconds=20)
-    assert Image.open(folder / "day 1" / "2.jpg").tobytes() == pixels
-    assert run(folder, "--undo").exit_code == 0
-    assert contents(folder) == before
-
-
-def test_a_photo_keeps_its_owner_group_mode_and_attributes(
+def test_a_sidecar_keeps_its_owner_group_mode_and_attributes(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = folder / "day 1" / "2.jpg"
+    path = folder / "day 1" / "2.jpg.xmp"
+    path.write_bytes(EMPTY_SIDECAR)
     if os.geteuid() == 0:
         os.chown(path, 10001, 10002)
     else:
@@ -240,7 +215,7 @@ def test_a_photo_keeps_its_owner_group_mode_and_attributes(
         return status.st_uid, status.st_gid, status.st_mode, [os.getxattr(path, n) for n in names]
 
     before, content = attributes(), path.read_bytes()
-    assert run(folder, "--write", "exif").exit_code == 0
+    assert run(folder, "--write", "sidecar").exit_code == 0
     assert path.read_bytes() != content
     assert attributes() == before
     monkeypatch.setattr("os.link", Mock(side_effect=OSError("no hard links")))
@@ -248,9 +223,10 @@ def test_a_photo_keeps_its_owner_group_mode_and_attributes(
     assert (path.read_bytes(), attributes()) == (content, before)
 
 
-def test_a_photo_whose_owner_would_change_is_left_as_it_is(
+def test_a_sidecar_whose_owner_would_change_is_left_as_it_is(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    (folder / "day 1" / "2.jpg.xmp").write_bytes(EMPTY_SIDECAR)
     before = contents(folder)
     mine = Path.stat
 
@@ -262,7 +238,7 @@ def test_a_photo_whose_owner_would_change_is_left_as_it_is(
 
     monkeypatch.setattr(Path, "stat", of_another_user)
     monkeypatch.setattr("os.chown", Mock(side_effect=PermissionError))
-    result = run(folder, "--write", "exif")
+    result = run(folder, "--write", "sidecar")
     assert result.exit_code == 1
     assert "belongs to user" in result.stderr
     assert {n: c for n, c in contents(folder).items() if "placewise" not in n} == before
@@ -304,41 +280,13 @@ def test_control_characters_of_names_do_not_reach_the_terminal(folder: Path) -> 
     assert name in {each["filename"] for each in json.loads(as_json.stdout)["proposals"]}
 
 
-def test_a_photo_whose_exif_cannot_be_written_is_skipped_with_the_reason(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*position: object) -> None:
-        """Writes nothing."""
-
-    monkeypatch.setattr("services.cli.locate.writers.find_exif_writer", lambda: fail)
-    result = run(folder, "--write", "exif")
-    assert result.exit_code == 1
-    assert "can't be read back" in result.stderr
-    assert "0 files written" in result.stderr
-
-
-def test_missing_exiftool_is_named_with_the_ways_to_get_it(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("shutil.which", lambda name: None)
-    result = run(folder, "--write", "exif")
-    assert result.exit_code == 1
-    for words in ("no_exif_writer", "apt install libimage-exiftool-perl", "--write sidecar"):
-        assert words in " ".join(result.stderr.split())
-
-
-def test_a_table_can_be_indexed_and_waypoints_have_names_and_times(folder: Path) -> None:
+def test_a_table_can_be_indexed(folder: Path) -> None:
     assert run(folder, "--write", "csv").exit_code == 0
     table = folder / "placewise-locations.csv"
     entries = read_csv_manifest(table.read_bytes(), "table")
     assert [entry.name for entry in entries] == ["day 1/2.jpg"]
     assert entries[0].fields.keys() == {"latitude", "longitude"}
     assert table.read_text().startswith("filename,latitude,longitude,heading,place\n")
-    assert run(folder, "--write", "gpx").exit_code == 0
-    root = ElementTree.parse(folder / "placewise-locations.gpx").getroot()
-    point = root[0]
-    assert [child.text for child in point][:2] == ["2026-05-01T12:00:20Z", "day 1/2.jpg"]
-    assert float(point.attrib["lat"]) == pytest.approx(LATITUDE + 20 * DEGREES_PER_M, abs=1e-5)
     assert run(folder, "--undo").exit_code == 0
     assert not list(folder.glob("placewise-locations*"))
 
@@ -466,19 +414,13 @@ def test_a_map_with_labels_only_gives_places(folder: Path, server: FakeServer) -
     will_find(server, by_label, by_label)
     found = searched_proposals(server, folder)["4.jpg"]
     assert (found["place"], found["accepted"], found["position"]) == ("tower/floor 7", True, None)
-    result = searched(server, folder, "--write", "gpx")
+    result = searched(server, folder, "--write", "sidecar")
     assert (result.exit_code, "--write csv" in result.stderr) == (1, True)
     assert searched(server, folder, "--write", "csv").exit_code == 0
     assert "4.jpg,,,,tower/floor 7" in (folder / "placewise-locations.csv").read_text()
 
 
-@pytest.mark.parametrize("target", ["exif", "sidecar"])
-def test_heading_and_position_of_a_pose_are_written_unless_the_photo_has_a_heading(
-    folder: Path, server: FakeServer, target: str
-) -> None:
-    exif = Image.Exif()
-    exif.get_ifd(IFD.GPSInfo)[GPS.GPSImgDirection] = 10.0
-    (folder / "4.jpg").write_bytes(encoded(photo_image(1), "JPEG", exif=exif))
+def test_heading_and_position_of_a_pose_are_written(folder: Path, server: FakeServer) -> None:
     north = 30 * DEGREES_PER_M
     posed = answer(pose={**POSE, "latitude": LATITUDE + north, "longitude": LONGITUDE})
     will_find(server, posed, posed)
@@ -491,20 +433,9 @@ def test_heading_and_position_of_a_pose_are_written_unless_the_photo_has_a_headi
     table = (folder / "placewise-locations.csv").read_bytes()
     entries = {entry.name: entry.fields for entry in read_csv_manifest(table, "table")}
     assert float(entries["day 1/2.jpg"]["heading"]) == POSE["heading"]
-    assert searched(server, folder, "--write", target).exit_code == 0
-    if target == "sidecar":
-        sidecar = (folder / "day 1" / "2.jpg.xmp").read_text()
-        assert 'GPSImgDirection="33804/100"' in sidecar
-        return
-    headers = []
-    for path in (folder / "day 1" / "2.jpg", folder / "4.jpg"):
-        with path.open("rb") as file:
-            headers.append(read_photo_header(file, 10**9))
-        with pyexiv2.Image(str(path)) as image:
-            tags = image.read_exif()
-        radius_m = float(Fraction(tags["Exif.GPSInfo.GPSHPositioningError"]))
-        assert radius_m == pytest.approx(0.42, abs=0.015)
-    assert [header.heading for header in headers] == [POSE["heading"], 10]
+    assert searched(server, folder, "--write", "sidecar").exit_code == 0
+    sidecar = (folder / "day 1" / "2.jpg.xmp").read_text()
+    assert 'GPSImgDirection="33804/100"' in sidecar
 
 
 def test_a_place_that_is_not_probable_enough_is_not_written_with_the_position(
@@ -522,17 +453,16 @@ def test_a_place_that_is_not_probable_enough_is_not_written_with_the_position(
     assert entries["day 1/2.jpg"] == {"latitude", "longitude"}
 
 
-def test_a_photo_that_is_changed_while_its_exif_is_written_keeps_the_change(
+def test_a_sidecar_that_is_changed_while_it_is_written_keeps_the_change(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    photo_file = folder / "day 1" / "2.jpg"
-    found = writers.find_exif_writer()
+    sidecar = folder / "day 1" / "2.jpg.xmp"
 
-    def write_slowly(*arguments: Any) -> None:
-        found(*arguments)
-        photo_file.write_bytes(photo(20, camera="edited"))
+    def add_slowly(*arguments: Any) -> bytes:
+        sidecar.write_bytes(EMPTY_SIDECAR)
+        return add_position(*arguments)
 
-    monkeypatch.setattr(writers, "find_exif_writer", lambda: write_slowly)
-    result = run(folder, "--write", "exif")
+    monkeypatch.setattr(writers, "add_position", add_slowly)
+    result = run(folder, "--write", "sidecar")
     assert (result.exit_code, "changed the file meanwhile" in result.stderr) == (1, True)
-    assert photo_file.read_bytes() == photo(20, camera="edited")
+    assert sidecar.read_bytes() == EMPTY_SIDECAR

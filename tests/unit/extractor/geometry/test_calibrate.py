@@ -41,6 +41,8 @@ def left_out(
     similarity: Similarity | None = None,
     component: Component | None = None,
     features: Mapping[UUID, LocalFeatures] | None = None,
+    *,
+    knows_lens: bool = False,
 ) -> list[LeftOutPose | None]:
     reports: list[int] = []
     photos = ComponentPhotos(
@@ -51,8 +53,8 @@ def left_out(
         [500 / 640 if n % 2 else None for n in range(COUNT)],
         similarity,
     )
-    found = localise_left_out(photos, MutualNearest(0.9), reports.append)
-    assert reports == list(range(1, COUNT + 1))
+    found = localise_left_out(photos, MutualNearest(0.9), reports.append, knows_lens=knows_lens)
+    assert reports == list(range(1, len(found) + 1))
     return found
 
 
@@ -78,11 +80,26 @@ def test_photos_of_an_imported_camera_are_localised_with_its_rays(
     }
     rays = rays_of(CAMERA, bytes([7] * 32), SHRINKS)
     imported = scene.component.with_rays(dict.fromkeys(scene.features, rays))
-    poses = left_out(scene, np.full(COUNT, np.nan), None, imported, shrunk)
-    assert all(pose and pose.distance < 10 * pose.distance_sigma for pose in poses)
-    without_rays = left_out(scene, np.full(COUNT, np.nan))
-    expected = np.median([pose.distance for pose in without_rays if pose])
-    assert np.median([pose.distance for pose in poses if pose]) < 3 * expected
+    for knows_lens in (True, False):
+        poses = left_out(
+            scene, np.full(COUNT, np.nan), None, imported, shrunk, knows_lens=knows_lens
+        )
+        assert len(poses) == COUNT
+        assert all(pose and pose.distance < 10 * pose.distance_sigma for pose in poses)
+        without_rays = left_out(scene, np.full(COUNT, np.nan), knows_lens=knows_lens)
+        expected = np.median([pose.distance for pose in without_rays if pose])
+        assert np.median([pose.distance for pose in poses if pose]) < 3 * expected
+
+
+def test_photos_by_other_lenses_are_expected_to_be_less_exact(scene: ReconstructedScene) -> None:
+    anywhere = np.full(COUNT, np.nan)
+    known = left_out(scene, anywhere, knows_lens=True)
+    assert len(known) == COUNT / 2  # the others have no focal length in their EXIF
+    for own, other in zip(known, left_out(scene, anywhere)[1::2], strict=True):
+        assert own
+        assert other
+        assert other.distance_sigma > own.distance_sigma
+        assert other.distance < 4 * other.distance_sigma
 
 
 def test_errors_of_an_aligned_component_are_horizontal(scene: ReconstructedScene) -> None:
