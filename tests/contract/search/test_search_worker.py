@@ -9,7 +9,6 @@ from typing import Any, BinaryIO
 import numpy as np
 import pytest
 
-from services.search import memory_index
 from services.search import worker as worker_module
 from services.search.catalog_sync import read_generation_versions, sync_snapshot
 from services.search.snapshot import Snapshot
@@ -91,7 +90,7 @@ class TestSearchWorker(SearchPortContract):
     ) -> None:
         """Reading such a mapping would end the process. A deleted file is read on."""
         monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
-        monkeypatch.setattr(memory_index, "FILE_CHECK_SECONDS", 0.0)
+        monkeypatch.setattr(worker_module, "FILE_CHECK_SECONDS", 0.0)
         places.add(unit_rows(1, 5))
         retained = places.reference(places.add(unit_rows(2, 5))[0])[0]
         (key,) = set(places.chunk_keys()) - {retained}
@@ -188,7 +187,7 @@ def test_queries_wait_for_one_slow_load_no_longer_than_their_deadline(
         goes_on.wait(60)
         return sync_snapshot(*arguments)
 
-    monkeypatch.setattr(memory_index, "sync_snapshot", load_slowly)
+    monkeypatch.setattr(worker_module, "sync_snapshot", load_slowly)
     for _ in range(3):
         with pytest.raises(Unavailable) as refused:
             worker.search(request)
