@@ -152,7 +152,7 @@ def test_api_servers_and_flower_require_their_passwords(machine: Machine) -> Non
             assert httpx2.get(machine.url("flower") + path, auth=wrong).status_code == 401, path
 
 
-def test_photo_is_described_and_found_in_both_shards(api: Caller) -> None:
+def test_photo_is_described_and_found(api: Caller) -> None:
     for job in [api.upload(number) for number in range(PHOTOS)]:
         api.succeeded(job)
     answer = api.search(5)
