@@ -395,21 +395,13 @@ class AsyncClient(AsyncTransport):
         """Restore a deleted photo."""
         return answers.OnePhoto(**await self._call("POST", f"/uploads/{file_id}/restore"))
 
-    async def propose_places(self, /, **options: Any) -> AsyncIterator[answers.PlaceProposal]:
+    def propose_places(self, /, **options: Any) -> AsyncIterator[answers.PlaceProposal]:
         """Iterate over proposals for the map's photos without a place. Nothing is stored.
 
         Args:
             options: `track`, `radius_m`, `motion` and `together`, as for `propose_positions`.
         """
-        cursor: str | None = None
-        while True:
-            params = drop_none(cursor=cursor)
-            page = await self._call("POST", "/places/proposals", params=params, json=options)
-            for each in page["proposals"]:
-                yield answers.PlaceProposal(**each)
-            cursor = page["next_cursor"]
-            if cursor is None:
-                return
+        return self._iterate(answers.PlaceProposal, "/places/proposals", "proposals", body=options)
 
     async def give_places(self, photos: Sequence[Json]) -> answers.GivenPlaces:
         """Give places to photos that have none; those that have one are skipped and named.

@@ -151,13 +151,17 @@ class AsyncTransport:
         return await self._retry(attempt)
 
     async def _iterate(
-        self, model: type[Record], path: str, field: str, /, **params: Any
+        self, model: type[Record], path: str, field: str, /, body: Json | None = None, **params: Any
     ) -> AsyncIterator[Record]:
-        """Iterate over all records of a paginated list; pages are fetched on demand."""
+        """Iterate over all records of a paginated list; pages are fetched on demand.
+
+        Those that are computed from a `body` have the server's default size.
+        """
+        method, limit = ("GET", PAGE_SIZE) if body is None else ("POST", None)
         cursor: str | None = None
         while True:
-            page_params = drop_none(**params, limit=PAGE_SIZE, cursor=cursor)
-            page = await self._call("GET", path, params=page_params)
+            page_params = drop_none(**params, limit=limit, cursor=cursor)
+            page = await self._call(method, path, params=page_params, json=body)
             for record in page[field]:
                 yield model(**record)
             cursor = page["next_cursor"]

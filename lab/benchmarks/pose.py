@@ -61,7 +61,7 @@ from shared.geometry.frames import Alignment, EastNorthUp, align
 from shared.geometry.localise import LocalPose, NoPose, localise
 from shared.geometry.radius import PoseCalibration, geo_pose
 from shared.matching.detectors import load_detector
-from shared.matching.features import FULL_SIDE, LocalFeatures
+from shared.matching.features import LocalFeatures
 from shared.matching.matchers import MutualNearest
 
 WORDS = 32
@@ -163,18 +163,13 @@ class MappedPhotos:
         """Localise a photo of an ideal camera as a real lens would have taken it."""
         rng = np.random.default_rng(len(self.pose_seconds))
         second, fourth = rng.normal((-0.03, 0.0), (0.06, 0.03))
-        size, focal = (
-            np.array([query.width, query.height]),
-            camera.focal * query.width / camera.width,
-        )
+        size = np.array([query.width, query.height])
+        focal = camera.focal * query.width / camera.width
         offsets = query.pixels() - size / 2
         squares = np.sum(offsets**2, axis=1, keepdims=True) / focal**2
         bent = offsets * (1 + second * squares + fourth * squares**2)
         pixels = bent + size / 2 + rng.normal(0, 0.005 * max(size), 2)
-        is_seen = ((pixels >= 0) & (pixels <= size)).all(axis=1)
-        positions = np.round(pixels[is_seen] * FULL_SIDE / size).astype(np.uint16)
-        descriptors = query.descriptors[is_seen]
-        return self.localise(replace(query, positions=positions, descriptors=descriptors))
+        return self.localise(query.moved_to(pixels))
 
     def calibrate(self, component: int, alignment: Alignment | None) -> PoseCalibration:
         """Localise the component's photos without themselves."""

@@ -76,8 +76,7 @@ def geo_pose(
 
     The square of a radius is the sum of that of the pose in its component, the calibrated quantile
     times its standard deviation, that of the alignment at its position, and that of the camera
-    model. Heading, pitch and roll
-    are relative to north and up at the position itself, not at the origin.
+    model. Heading, pitch and roll are relative to north and up at the position, not at the origin.
     """
     if pose.camera_source == CameraSource.MAP or pose.camera.rays is not None:
         calibration = calibration.known_lens or calibration

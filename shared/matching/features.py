@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -64,6 +64,13 @@ class LocalFeatures:
     def pixels(self) -> Points:
         """Return the (n, 2) positions in pixels of the upright photo; the corner is (0, 0)."""
         return self.positions * (np.array([self.width, self.height]) / FULL_SIDE)
+
+    def moved_to(self, pixels: Points) -> Self:
+        """Return the features at these (n, 2) pixels; those outside of the photo are left out."""
+        size = self.width, self.height
+        is_seen = ((pixels >= 0) & (pixels <= size)).all(axis=1)
+        positions = np.round(pixels[is_seen] * FULL_SIDE / size).astype(np.uint16)
+        return replace(self, positions=positions, descriptors=self.descriptors[is_seen])
 
     def working_pixels(self) -> Points:
         """Return the (n, 2) positions in pixels of the photo scaled to WORKING_SIDE."""

@@ -28,7 +28,7 @@ from shared.geometry.radius import (
     horizontal_sigma,
     normal_radii,
 )
-from shared.matching.features import FULL_SIDE, WORKING_SIDE, LocalFeatures
+from shared.matching.features import WORKING_SIDE, LocalFeatures
 from shared.matching.matchers import Matcher
 
 CANDIDATES = 10
@@ -196,9 +196,7 @@ def _as_another_photo(
         squares = np.sum(offsets**2, axis=1, keepdims=True) / camera.focal_pixels**2
         bent = 1 + random.normal(0, OTHER_LENS.radial) * squares
         pixels = np.array(size) / 2 + bent * offsets + shift
-    is_seen = ((pixels >= 0) & (pixels <= size)).all(axis=1)
-    positions = np.round(pixels[is_seen] * FULL_SIDE / size).astype(np.uint16)
-    return replace(features, positions=positions, descriptors=features.descriptors[is_seen])
+    return features.moved_to(pixels)
 
 
 def _without(

@@ -172,7 +172,7 @@ def test_an_extractor_counts_its_batches_stages_and_losses(averages: Harness) ->
 
     assert value("placewise_extractor_batch_jobs_sum", kind="index") == 3
     assert value("placewise_extractor_jobs_total", kind="index", outcome="succeeded") == 3
-    for stage in ("read", "decode", "thumbnails", "describe", "features", "publish"):
+    for stage in ("read", "decode", "describe", "features", "publish"):
         assert value("placewise_extractor_stage_seconds_count", stage=stage) == 1, stage
     assert value("placewise_extractor_model_load_seconds_count") == 1
 

@@ -132,10 +132,12 @@ def test_the_headline_and_the_reason_are_those_of_the_server(tmp_path: Path) -> 
     assert lines[at + 1] == "So it is."
 
 
-def test_certainty_and_share_from_elsewhere_are_sent_to_the_server(tmp_path: Path) -> None:
-    _, path = query(tmp_path, estimate(PLACES), "--certainty", "0.8", "--elsewhere", "0.1")
+def test_options_of_the_search_are_sent_to_the_server(tmp_path: Path) -> None:
+    options = {"certainty": "0.8", "elsewhere": "0.1", "rerank": "10", "top_k": "2"}
+    given = [f"--{name.replace('_', '-')}={value}" for name, value in options.items()]
+    _, path = query(tmp_path, estimate(PLACES), *given)
     sent = parse_qs(urlsplit(path).query)
-    assert (sent["certainty"], sent["elsewhere"]) == (["0.8"], ["0.1"])
+    assert {name: sent[name] for name in options} == {name: [v] for name, v in options.items()}
 
 
 def test_a_pose_is_a_table_of_80_columns_and_tab_separated_values_in_a_pipe(
