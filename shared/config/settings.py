@@ -12,7 +12,7 @@ import os
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pydantic import Field, SecretStr, model_validator
+from pydantic import Field, SecretStr
 from pydantic.fields import FieldInfo
 from pydantic_settings import (
     BaseSettings,
@@ -182,15 +182,6 @@ class Settings(
         """Add files with secrets to the sources: arguments, environment, `.env`, files."""
         return (init_settings, env_settings, dotenv_settings, SecretFilesSource(settings_cls))
 
-    @model_validator(mode="after")
-    def _check_batch_fits_slot(self) -> Self:
-        if self.batch_photos > self.slot_rows:
-            raise ValueError(
-                f"BATCH_PHOTOS ({self.batch_photos}) may not exceed SLOT_ROWS ({self.slot_rows}): "
-                "a batch becomes one chunk, and a chunk must fit into a slot"
-            )
-        return self
-
     def for_device(self, device: str) -> Self:
         """Return the settings of an extractor on `cpu` or `cuda`, which decides what is unset."""
         processors = len(os.sched_getaffinity(0))
@@ -198,7 +189,7 @@ class Settings(
         decoders = max(decoders, 2) * (1 if self.s3_endpoint is None else 2)
         chosen = {"decode_processes": min(decoders, MAX_DECODE_PROCESSES)}
         if device == "cuda":
-            chosen["batch_photos"] = min(GPU_BATCH_PHOTOS, self.slot_rows)
+            chosen["batch_photos"] = GPU_BATCH_PHOTOS
         unset = chosen.keys() - self.model_fields_set
         return self.model_copy(update={name: chosen[name] for name in unset})
 

@@ -301,7 +301,7 @@ def fleet() -> Iterator[Fleet]:
         extractor="test-slow-avg:milliseconds=20,width=256",  # so that a kill finds it at work
         lease_seconds=2.0,
         batch_photos=8,
-        slot_rows=50,
+        chunk_rows=50,
     ) as opened:
         for name, seconds in CLOCK_OFFSETS_SECONDS.items():
             opened[name].environment.update(clock_off_by(seconds))

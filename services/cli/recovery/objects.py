@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from services.cli.recovery.journal_rows import ROWS_PER_STATEMENT, Progress, RecoveryReport
 from shared.catalog.batch_items import BatchItem
-from shared.catalog.chunks import Chunk, Descriptor, allocate_slot
+from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, RowType
 from shared.catalog.maps import get_or_create_default_map, increment_map_version
@@ -40,7 +40,6 @@ CHUNKS = "chunks/"
 def recover_chunks(
     catalog: Catalog,
     store: ObjectStore,
-    slot_rows: int,
     recovered: RecoveryReport,
     progress: Progress,
 ) -> None:
@@ -69,7 +68,7 @@ def recover_chunks(
         elif manifest.generation_id not in states:
             recovered.unnamed_descriptors += len(manifest.photo_ids)
         elif states[manifest.generation_id] in (GenerationState.ACTIVE, GenerationState.BUILDING):
-            _recover_chunk(catalog, store, key, manifest, slot_rows, recovered)
+            _recover_chunk(catalog, store, key, manifest, recovered)
         progress("chunks", done, len(keys))
 
 
@@ -78,7 +77,6 @@ def _recover_chunk(
     store: ObjectStore,
     key: str,
     manifest: ChunkManifest,
-    slot_rows: int,
     recovered: RecoveryReport,
 ) -> None:
     with catalog.read() as session:
@@ -98,7 +96,6 @@ def _recover_chunk(
             Chunk(
                 id=manifest.chunk_id,
                 generation_id=generation.id,
-                slot=allocate_slot(generation, len(rows), slot_rows),
                 object_key=key,
                 rows=len(rows),
                 size_bytes=len(data),

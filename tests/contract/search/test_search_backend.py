@@ -52,7 +52,7 @@ class SearchPortContract:
 
     def test_order_and_scores_equal_brute_force(self, places: SmallMap, port: OpenPort) -> None:
         for seed, count in enumerate((1, 30, 7)):
-            places.add(unit_rows(seed, count), slot=seed // 2, dead=seed)
+            places.add(unit_rows(seed, count), dead=seed)
         search = port()
         for seed in range(5):
             vector = unit_rows(100 + seed, 1)[0]

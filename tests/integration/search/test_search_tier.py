@@ -41,8 +41,8 @@ VECTOR = unit_rows(1000, 1)[0]
 @pytest.fixture
 def places(catalog: Catalog, store: FolderStore) -> SmallMap:
     made = SmallMap(catalog, store)
-    for slot in range(3):
-        made.add(unit_rows(slot, 3), slot)
+    for seed in range(3):
+        made.add(unit_rows(seed, 3))
     return made
 
 
