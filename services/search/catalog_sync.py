@@ -35,7 +35,7 @@ from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map
 from shared.catalog.photos import PhotoFilterValues, list_photos_changed_since
 from shared.errors import NotFound, Unavailable
-from shared.search_api.protocol import IndexPart, ReplicationLag
+from shared.search_api.protocol import ReplicationLag
 from shared.storage import ObjectStore
 from shared.storage.chunks import CODED_DIMENSION
 from shared.storage.read_retries import ReadRetries
@@ -143,17 +143,13 @@ def sync_snapshot(
 
 def _apply_memory_budget(memory_budget: MemoryBudget, snapshot: Snapshot) -> Snapshot:
     """Return the snapshot with as many parts in memory as the budget allows."""
-    parts = memory_parts(snapshot.chunks)
-    resident_parts = memory_budget.allocate(
-        snapshot.generation_id, [size_bytes for _, size_bytes in parts]
-    )
+    sizes = memory_parts(snapshot.chunks)
+    resident_parts = memory_budget.allocate(snapshot.generation_id, sizes)
     return replace(
         snapshot,
         chunks=tuple(hold_in_memory(chunk, resident_parts) for chunk in snapshot.chunks),
-        parts=tuple(
-            IndexPart(name=name, size_bytes=size_bytes, resident=number < resident_parts)
-            for number, (name, size_bytes) in enumerate(parts)
-        ),
+        resident_bytes=sum(sizes[:resident_parts]),
+        mapped_bytes=sum(sizes[resident_parts:]),
     )
 
 

@@ -1,10 +1,10 @@
 """Search on Milvus, for maps larger than one machine.
 
-`MilvusWorker` holds no rows. It writes them to a collection of each generation, by whichever worker
-holds the generation's lock, and asks Milvus for candidates. The chunks in the object store stay the
-truth: cosines are computed from their rows, and what a collection lacks is written in steps of a
-few seconds and named in `missing` until then. A row of the collection that is no photo, its *mark*,
-has the version of the map up to which changes of photos are in it.
+`MilvusWorker` holds no rows: one worker at a time writes them to a collection of the generation,
+and all ask Milvus for candidates. The chunks in the object store stay the truth: cosines are
+computed from their rows, and what a collection lacks is written in steps of a few seconds and named
+in `missing` until then. A row of the collection that is no photo, its *mark*, has the version of
+the map up to which changes of photos are in it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import logging
 import math
 import random
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -55,7 +55,6 @@ from shared.search_api.protocol import (
     APPROXIMATE,
     EXHAUSTIVE,
     NONE,
-    LoadedGeneration,
     SearchHit,
     SearchRequest,
     SearchResponse,
@@ -97,9 +96,8 @@ def engine_errors() -> Iterator[None]:
         yield
     except MILVUS_ERRORS as error:
         reason = getattr(error, "message", "") or type(error).__name__
-        raise Unavailable(
-            "engine_unavailable", f"Milvus does not answer: {reason}. Retry in a moment."
-        ) from error
+        detail = f"Milvus does not answer: {reason}. Retry in a moment."
+        raise Unavailable("engine_unavailable", detail) from error
 
 
 @contextlib.contextmanager
@@ -127,14 +125,8 @@ class MilvusSnapshot(Snapshot):
     """Its name; empty where there is nothing to search."""
     written: frozenset[str]
     """Objects of the chunks whose photos are all in it."""
-    unwritten: frozenset[str]
-    """Objects of the other chunks that can be read."""
-    held: LoadedGeneration
-
-    @cached_property
-    def live_rows(self) -> int:
-        """Number of searchable rows."""
-        return self.held.rows
+    live_rows: int
+    row_length: int
 
 
 @dataclass(slots=True)
@@ -143,12 +135,14 @@ class _Watch:
 
     check_at: float = 0.0
     unknown_since: float = math.inf
-    wrong: set[UUID] = field(default_factory=set)
-    """Photos whose rows differ from those of their chunks."""
-    answers: list[tuple[MilvusSnapshot, Row, tuple[SearchHit, ...]]] = field(default_factory=list)
-    """Recent ones, of which `expected` rows were compared and `found` were in the answer."""
+    wrong: set[str] = field(default_factory=set)
+    """Keys of photos whose rows differ from those of their chunks."""
+    answers: deque[tuple[MilvusSnapshot, Row, tuple[SearchHit, ...]]] = field(
+        default_factory=partial(deque, maxlen=RECALL_ANSWERS)
+    )
     found: float = 0.0
     expected: float = 0.0
+    """Rows of chunks that answers had to have; `found` of them were there."""
 
 
 class MilvusWorker(SearchWorker):
@@ -183,13 +177,8 @@ class MilvusWorker(SearchWorker):
     def status(self) -> SearchStatus:
         """Return what the collections hold."""
         watches = list(self._watches.items())
-        held = [one for one in self._snapshots.values() if isinstance(one, MilvusSnapshot)]
-        update = {
-            "incomplete": tuple(one.generation_id for one in held if one.missing or one.unwritten),
-            "unwritten": sum(len(one.unwritten) for one in held),
-            "recalls": {key: one.found / one.expected for key, one in watches if one.expected},
-        }
-        return super().status().model_copy(update=update)
+        recalls = {key: one.found / one.expected for key, one in watches if one.expected}
+        return super().status().model_copy(update={"recalls": recalls})
 
     @engine_errors()
     def _list_stored(self) -> list[str]:
@@ -198,12 +187,11 @@ class MilvusWorker(SearchWorker):
 
     @engine_errors()
     def _remove_stored(self, stored: list[str], known: Collection[UUID]) -> None:
-        watches = {key: watch for key, watch in self._watches.items() if key in known}
-        self._watches = defaultdict(_Watch, watches)
-        newest = {name.split("_")[2]: name for name in stored}
+        for ended in self._watches.keys() - known:
+            del self._watches[ended]
+        newest = {UUID(name.split("_")[2]): name for name in stored}
         for name in stored:
-            generation = name.split("_")[2]
-            if UUID(generation) not in known or name != newest[generation]:
+            if name not in [newest.get(one) for one in known]:
                 log.info("dropping the collection %s, which is no longer used", name)
                 self.client.drop_collection(name, timeout=WRITE_SECONDS)
 
@@ -214,11 +202,10 @@ class MilvusWorker(SearchWorker):
         watch = self._watches[snapshot.generation_id]
         if snapshot.unwritten or self._unreadable.any_due(snapshot.missing) or watch.wrong:
             return True
-        try:
+        with contextlib.suppress(*MILVUS_ERRORS):  # perhaps it was dropped
             is_current = self._read_mark(snapshot.collection) == snapshot.version
-        except MILVUS_ERRORS:  # perhaps it was dropped
-            return True
-        return not is_current or time.monotonic() >= watch.check_at
+            return not is_current or time.monotonic() >= watch.check_at
+        return True
 
     @engine_errors()
     def _sync_generation(self, generation_id: UUID, old: Snapshot | None) -> Snapshot | None:
@@ -278,8 +265,6 @@ class MilvusWorker(SearchWorker):
             self._delete(name, ["~nothing"])
         others = chunks.keys() - written
         unwritten = frozenset(key for key in others if self._unreadable.is_due(key))
-        rows = self._count(name, FINDABLE) if marked is not None else 0
-        dimension = generation.dimension if chunks else 0
         return MilvusSnapshot(
             generation_id=generation_id,
             map_id=generation.map_id,
@@ -289,7 +274,8 @@ class MilvusWorker(SearchWorker):
             collection="" if marked is None else name,
             written=written,
             unwritten=unwritten,
-            held=LoadedGeneration(rows=rows, dimension=dimension, parts=()),
+            live_rows=self._count(name, FINDABLE) if marked is not None else 0,
+            row_length=generation.dimension if chunks else 0,
         )
 
     def _open_collection(self, watch: _Watch, name: str) -> int | None:
@@ -302,11 +288,11 @@ class MilvusWorker(SearchWorker):
             self.client.load_collection(name, timeout=WRITE_SECONDS)
             marked = self._read_mark(name)
         except MilvusException as error:
-            now = time.monotonic()
-            watch.unknown_since = min(watch.unknown_since, now)
-            if error.code != NO_COLLECTION or now < watch.unknown_since + UNKNOWN_SECONDS:
+            watch.unknown_since = min(watch.unknown_since, time.monotonic())
+            waited = time.monotonic() - watch.unknown_since
+            if error.code != NO_COLLECTION or waited < UNKNOWN_SECONDS:
                 raise
-            marked = None
+            return None
         watch.unknown_since = math.inf
         return marked
 
@@ -336,9 +322,8 @@ class MilvusWorker(SearchWorker):
     def _write_mark(self, name: str, dimension: int, version: int) -> None:
         """Say that all changes up to this version are written."""
         mark = {"photo": MARK, "captured_at": version, "findable": False, "place": "", "tags": []}
-        vector = np.eye(1, dimension, dtype=np.float32)[0]
-        row = {**mark, "latitude": 0.0, "longitude": 0.0, "vector": vector}
-        self.client.upsert(name, [row], timeout=WRITE_SECONDS)
+        where = {"latitude": 0.0, "longitude": 0.0, "vector": [1.0] + [0.0] * (dimension - 1)}
+        self.client.upsert(name, [mark | where], timeout=WRITE_SECONDS)
 
     def _get(self, name: str, keys: Sequence[str], column: str) -> list[Any]:
         """Return the column of those of these rows that are there."""
@@ -414,18 +399,17 @@ class MilvusWorker(SearchWorker):
         self, name: str, chunk: Chunk, photos: Sequence[tuple[int, PhotoFilterValues]]
     ) -> bool:
         """Write rows of a chunk with the values of their photos; False if it can't be read."""
-        few = len(photos) <= FEW_ROWS
+        numbers = [row for row, _ in photos]
         size = max(1, BATCH_BYTES * chunk.rows // chunk.size_bytes)
         try:
-            stored = None if few else read_chunk(self._store, chunk.object_key, chunk.sha256)
-            for some in _batches(photos, min(size, IDS_PER_CALL)):
-                numbers = [row for row, _ in some]
-                if stored is None:
-                    rows = self._read_rows(chunk.object_key, numbers)
-                else:
-                    rows = stored[numbers].astype(np.float32)
-                pairs = zip(some, rows, strict=True)
-                data = [{**filter_columns(photo), "vector": row} for (_, photo), row in pairs]
+            if len(photos) <= FEW_ROWS:
+                rows = self._read_rows(chunk.object_key, numbers)
+            else:
+                stored = read_chunk(self._store, chunk.object_key, chunk.sha256)
+                rows = stored[numbers].astype(np.float32)
+            pairs = list(zip(photos, rows, strict=True))
+            for some in _batches(pairs, min(size, IDS_PER_CALL)):
+                data = [{**filter_columns(photo), "vector": row} for (_, photo), row in some]
                 self.client.upsert(name, data, timeout=WRITE_SECONDS)
         except UNREADABLE as error:
             self._unreadable.failed(chunk.object_key, error)
@@ -436,33 +420,24 @@ class MilvusWorker(SearchWorker):
     def _find_losses(
         self, generation_id: UUID, name: str, described: int | None, written: frozenset[str]
     ) -> frozenset[str]:
-        """Return which of the written chunks need not be looked at again, all of them or none.
-
-        Milvus may have lost rows behind our back, or hold others, which are deleted here.
-        """
+        """Delete rows that no chunk has; returns `written`, or none if rows may have been lost."""
         watch = self._watches[generation_id]
-        others, watch.wrong = {photo_id.hex for photo_id in watch.wrong}, set()
+        others, watch.wrong = watch.wrong, set()
         if not others and (described is None or self._count(name, PHOTOS) == described):
             return written
         log.warning("%s does not hold what the chunks do: its photos are compared", name)
         with self._catalog.read() as session:
             photos = {photo_id.hex for photo_id in list_described(session, generation_id)}
-        options = {"output_fields": ["photo"], "consistency_level": "Strong"}
-        rows = self.client.query_iterator(
-            name, MAX_LIMIT, filter=PHOTOS, timeout=WRITE_SECONDS, **options
-        )
+        options = {"output_fields": ["photo"], "consistency_level": "Strong", "filter": PHOTOS}
+        rows = self.client.query_iterator(name, MAX_LIMIT, timeout=WRITE_SECONDS, **options)
         while batch := rows.next():
             others |= {row["photo"] for row in batch} - photos
         self._delete(name, sorted(others))
         return frozenset()
 
     def _measure_recall(self, watch: _Watch, chunks: Sequence[Chunk]) -> None:
-        """Compare recent answers with the rows of a random chunk.
-
-        What of it is more similar than an answer's last photo has to be in the answer.
-        """
-        answers, watch.answers = watch.answers, []
-        if not answers:
+        """Compare recent answers with a random chunk, whose more similar rows have to be there."""
+        if not watch.answers:
             return
         (chunk,) = random.sample(chunks, 1)
         try:
@@ -474,7 +449,8 @@ class MilvusWorker(SearchWorker):
             values = list_live_filter_values(session, chunk.id)
         photos = {row: photo.photo_id for row, photo in values if photo.findable}
         watch.found, watch.expected = 0.9 * watch.found, 0.9 * watch.expected
-        for snapshot, vector, hits in answers:
+        while watch.answers:
+            snapshot, vector, hits = watch.answers.popleft()
             if chunk.object_key in snapshot.written:
                 least = hits[-1].score + 2 * float32_error(rows.shape[1])
                 better = np.flatnonzero(rows @ vector > least).tolist()
@@ -491,7 +467,7 @@ class MilvusWorker(SearchWorker):
         product by both errors is complete.
         """
         assert isinstance(snapshot, MilvusSnapshot)
-        self._check_row_length(snapshot.held.dimension)
+        self._check_row_length(snapshot.row_length)
         with self._catalog.read() as session:
             condition = filter_expression(
                 request.photos,
@@ -525,12 +501,12 @@ class MilvusWorker(SearchWorker):
             limit = min(GROWTH * limit, MAX_LIMIT)
         certificate = EXHAUSTIVE if is_exact and complete else APPROXIMATE
         watch = self._watches[snapshot.generation_id]
-        wrong = {id_ for id_, score in scores.items() if abs(products[id_] - score) > error}
+        wrong = {id_.hex for id_, score in scores.items() if abs(products[id_] - score) > error}
         watch.wrong |= wrong
         if wrong or missing:
             certificate = NONE
         elif not is_exact and len(hits) == request.k and condition == FINDABLE:
-            watch.answers = [*watch.answers[1 - RECALL_ANSWERS :], (snapshot, unit, hits)]
+            watch.answers.append((snapshot, unit, hits))
         return SearchResponse(
             hits=hits,
             certificate=certificate,
@@ -560,12 +536,13 @@ class MilvusWorker(SearchWorker):
     @staticmethod
     def _in_circle(hits: Sequence[Any], circle: Circle | None) -> set[UUID]:
         """Return the photos of hits, and only those in the circle, not in its bounding box."""
-        photos = [hit["entity"] for hit in hits]
-        if circle is not None:
-            center = circle.latitude, circle.longitude
-            away = [distance_m(*center, photo["latitude"], photo["longitude"]) for photo in photos]
-            photos = [p for p, d in zip(photos, away, strict=True) if d <= circle.radius_m]
-        return {UUID(photo["photo"]) for photo in photos}
+
+        def is_inside(photo: Any) -> bool:
+            return circle is None or circle.radius_m >= distance_m(
+                circle.latitude, circle.longitude, photo["latitude"], photo["longitude"]
+            )
+
+        return {UUID(hit["entity"]["photo"]) for hit in hits if is_inside(hit["entity"])}
 
     def _score(
         self, generation_id: UUID, photo_ids: Sequence[UUID], query: Row

@@ -154,14 +154,11 @@ class WorkerHeartbeat:
     It runs in a thread of its own, because loading may take minutes while the worker is alive.
     """
 
-    def __init__(
-        self, catalog: Catalog, worker: SearchWorker, name: str, url: str | None = None
-    ) -> None:
+    def __init__(self, catalog: Catalog, worker: SearchWorker, name: str) -> None:
         self.id = new_id()
         self._catalog = catalog
         self._worker = worker
         self._name = name
-        self._url = url
         self._sent_versions: tuple[Mapping[UUID, int], Sequence[str]] | None = None
         self._sent_at = 0.0
 
@@ -188,7 +185,7 @@ class WorkerHeartbeat:
         if versions == self._sent_versions and time.monotonic() - self._sent_at < HEARTBEAT_SECONDS:
             return
         with self._catalog.write(is_heartbeat=versions == self._sent_versions) as session:
-            upsert_search_worker(session, self.id, self._name, self._url, *versions)
+            upsert_search_worker(session, self.id, self._name, *versions)
         self._sent_versions, self._sent_at = versions, time.monotonic()
 
 
@@ -206,7 +203,7 @@ def serve_search(settings: Settings, announce: Announce) -> None:
             registry = CollectorRegistry()
             worker = SearchWorker.from_settings(catalog, store, settings)
             url = reachable_url(host, port)
-            heartbeat = WorkerHeartbeat(catalog, worker, f"{socket.gethostname()}:{port}", url)
+            heartbeat = WorkerHeartbeat(catalog, worker, f"{socket.gethostname()}:{port}")
             # Its clients are a few gateways, with one connection for each concurrent query.
             limits = replace(ConnectionLimits.of(settings), per_address=0)
             server = http_server(create_search_app(worker, registry), Connections(limits))

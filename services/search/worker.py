@@ -1,9 +1,9 @@
 """Search worker: `SearchBackend` in process, on snapshots that are swapped atomically.
 
 `SearchWorker` keeps a snapshot of each generation in sync with the catalog and runs queries on the
-current one. `QueryRowReader` reads the row that a query refers to, which may lie in a chunk
-that has been merged since, or under `queries/`. It caches stored rows:
-the gateway asks for more hits of the same query, and evaluations use the same photos again.
+current one. `QueryRowReader` reads the row that a query refers to, which may lie in a chunk that
+has been merged since, or under `queries/`. It caches stored rows: the gateway asks for more hits of
+the same query, and evaluations use the same photos again.
 """
 
 from __future__ import annotations
@@ -198,11 +198,8 @@ class SearchWorker:
             try:
                 from services.search.milvus import MilvusWorker
             except ImportError as error:
-                raise Misconfigured(
-                    "no_milvus",
-                    "SEARCH_ENGINE=milvus needs the extra milvus: pip install pymilvus.",
-                ) from error
-
+                detail = "SEARCH_ENGINE=milvus needs the extra milvus: pip install pymilvus."
+                raise Misconfigured("no_milvus", detail) from error
             return MilvusWorker(catalog, store, settings)
         return cls(catalog, store, settings)
 
@@ -283,14 +280,13 @@ class SearchWorker:
         """Return what is loaded, with sizes and lags."""
         snapshots = self._snapshots
         versions = {key: snapshot.version for key, snapshot in snapshots.items()}
-        parts = [part for snapshot in snapshots.values() for part in snapshot.parts]
         return SearchStatus(
             rows=sum(snapshot.live_rows for snapshot in snapshots.values()),
-            resident_bytes=sum(part.size_bytes for part in parts if part.resident),
-            mapped_bytes=sum(part.size_bytes for part in parts if not part.resident),
-            held={key: snapshot.held for key, snapshot in snapshots.items()},
+            resident_bytes=sum(snapshot.resident_bytes for snapshot in snapshots.values()),
+            mapped_bytes=sum(snapshot.mapped_bytes for snapshot in snapshots.values()),
             versions=versions,
-            incomplete=tuple(key for key, snapshot in snapshots.items() if snapshot.missing),
+            incomplete=tuple(k for k, one in snapshots.items() if one.missing or one.unwritten),
+            unwritten=sum(len(snapshot.unwritten) for snapshot in snapshots.values()),
             missing=tuple(key for snapshot in snapshots.values() for key in snapshot.missing),
             disk_full=any(snapshot.disk_full for snapshot in snapshots.values()),
             lags=self.replication_lag.current_lags(versions),

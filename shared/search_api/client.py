@@ -98,35 +98,33 @@ class HttpSearchClient:
         Workers that lag behind are called again until the time is over.
         """
         deadline = time.monotonic() + self._timeout_seconds
-        behind: Unavailable | None = None
-        while not self._stop.is_set():
+        while True:
             urls = self._workers.urls(request.generation_id, request.min_version)
             try:
                 return self._call_any(urls, "search", request, SearchResponse, deadline)
             except Unavailable as error:
-                if error.code == BEHIND:  # a worker may answer in a moment
-                    behind = error
-                elif error.code != NO_ANSWER or behind is None:
+                retry = error.code == BEHIND and time.monotonic() + RETRY_PAUSE_SECONDS < deadline
+                if not retry or self._stop.wait(RETRY_PAUSE_SECONDS):
                     raise
-            if time.monotonic() + RETRY_PAUSE_SECONDS > deadline:
-                raise behind
-            time.sleep(RETRY_PAUSE_SECONDS)
-        raise Unavailable(NO_ANSWER, "The server is stopping. Retry in a moment.")
 
     def match(self, request: MatchRequest) -> MatchResponse:
         """Match local features on one worker; on the next one when it fails."""
-        deadline = time.monotonic() + self._timeout_seconds
-        return self._call_any(self._workers.urls(), "match", request, MatchResponse, deadline)
+        return self._call_any(self._workers.urls(), "match", request, MatchResponse)
 
     def estimate_pose(self, request: PoseRequest) -> PoseResponse:
         """Compute a pose on one worker; on the next one when it fails."""
-        deadline = time.monotonic() + self._timeout_seconds
-        return self._call_any(self._workers.urls(), "pose", request, PoseResponse, deadline)
+        return self._call_any(self._workers.urls(), "pose", request, PoseResponse)
 
     def _call_any(
-        self, urls: list[str], path: str, request: BaseModel, kind: type[Message], deadline: float
+        self,
+        urls: list[str],
+        path: str,
+        request: BaseModel,
+        kind: type[Message],
+        deadline: float | None = None,
     ) -> Message:
         """Return the first answer; raises what a worker refused with, if none answers."""
+        deadline = deadline or time.monotonic() + self._timeout_seconds
         refused = _no_answer()
         for url, seconds in _attempts(urls, deadline):
             try:

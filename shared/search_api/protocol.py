@@ -19,9 +19,7 @@ from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
 
 EXHAUSTIVE = "exhaustive"  # every row was compared exactly
 STATISTICAL = "statistical"  # no other row can be among them, but with odds of about 1 in 10^8
-APPROXIMATE = (
-    "approximate"  # an approximate index chose the rows, or the engine's limit was reached
-)
+APPROXIMATE = "approximate"  # chosen by an approximate index, or within the engine's limit
 NONE = "none"  # a part of the map is missing: better rows may exist
 
 CERTIFICATES = (EXHAUSTIVE, STATISTICAL, APPROXIMATE, NONE)
@@ -112,24 +110,6 @@ class ReplicationLag(_Message):
     """Whether the generation is active, and so serves queries; False while it is being built."""
 
 
-class IndexPart(_Message):
-    """One part of a generation's search index: a level of its codes, or its rows."""
-
-    name: str
-    size_bytes: int
-    resident: bool
-    """Whether it is held in memory; otherwise it is a mapped file in the system's page cache."""
-
-
-class LoadedGeneration(_Message):
-    """A generation that a worker has loaded."""
-
-    rows: int
-    """Including the rows of deleted photos."""
-    dimension: int
-    parts: tuple[IndexPart, ...]
-
-
 class SearchStatus(_Message):
     """State of a worker: rows and bytes in memory, and the loaded version of each generation.
 
@@ -141,8 +121,6 @@ class SearchStatus(_Message):
     mapped_bytes: int = 0
     """Bytes of mapped files that are not resident."""
     versions: dict[UUID, int]
-    held: dict[UUID, LoadedGeneration] = {}
-    """Loaded generations."""
     incomplete: tuple[UUID, ...] = ()
     """Generations with a chunk that can't be searched."""
     missing: tuple[str, ...]

@@ -38,10 +38,7 @@ CHUNKS = "chunks/"
 
 
 def recover_chunks(
-    catalog: Catalog,
-    store: ObjectStore,
-    recovered: RecoveryReport,
-    progress: Progress,
+    catalog: Catalog, store: ObjectStore, recovered: RecoveryReport, progress: Progress
 ) -> None:
     """Register the chunks with rows of photos that lack a descriptor in their generation.
 
@@ -104,14 +101,9 @@ def _recover_chunk(
             )
         )
         session.flush()
+        place = {"generation_id": generation.id, "chunk_id": manifest.chunk_id}
         descriptors = [
-            {
-                "generation_id": generation.id,
-                "photo_id": photo_id,
-                "chunk_id": manifest.chunk_id,
-                "row": row,
-            }
-            for photo_id, row in missing.items()
+            {**place, "photo_id": photo_id, "row": row} for photo_id, row in missing.items()
         ]
         session.execute(insert(Descriptor), descriptors)
         increment_map_version(session, generation.map_id)

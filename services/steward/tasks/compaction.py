@@ -121,13 +121,9 @@ def merge_chunks(
             columns = {"generation_id": generation_id, "sealed": True, **asdict(new_chunk)}
             session.add(Chunk(id=chunk_id, **columns))
             session.flush()
+            place = {"generation_id": generation_id, "chunk_id": chunk_id}
             session.add_all(
-                Descriptor(
-                    generation_id=generation_id,
-                    photo_id=photo_id,
-                    chunk_id=chunk_id,
-                    row=row,
-                )
+                Descriptor(**place, photo_id=photo_id, row=row)
                 for row, photo_id in enumerate(photo_ids)
                 if photo_id in present
             )

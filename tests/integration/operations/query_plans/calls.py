@@ -268,7 +268,7 @@ def _search_calls(
 
     def register() -> None:
         with catalog.write() as session:
-            upsert_search_worker(session, new_id(), "explained", None, {})
+            upsert_search_worker(session, new_id(), "explained", {})
 
     def evaluate() -> None:
         with catalog.read() as session:
