@@ -96,8 +96,9 @@ def engine_errors() -> Iterator[None]:
         yield
     except MILVUS_ERRORS as error:
         reason = getattr(error, "message", "") or type(error).__name__
-        detail = f"Milvus does not answer: {reason}. Retry in a moment."
-        raise Unavailable("engine_unavailable", detail) from error
+        raise Unavailable(
+            "engine_unavailable", f"Milvus does not answer: {reason}. Retry in a moment."
+        ) from error
 
 
 @contextlib.contextmanager

@@ -122,11 +122,5 @@ class WorkerDirectory:
     def best_status(self) -> SearchStatus | None:
         """Return the state of the most advanced worker that answers; None if none does."""
         with self._lock:
-            up = [worker for worker in self._workers if worker.is_up]
-            return max(up, key=_total_version).status if up else None
-
-
-def _total_version(worker: _WorkerState) -> tuple[int, bool]:
-    if worker.status is None:
-        return 0, False
-    return sum(worker.status.versions.values()), not worker.status.missing
+            found = [worker.status for worker in self._workers if worker.is_up and worker.status]
+        return max(found, key=lambda s: (sum(s.versions.values()), not s.missing), default=None)
