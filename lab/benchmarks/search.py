@@ -183,9 +183,7 @@ def load_worker(world: SyntheticMap) -> tuple[SearchWorker, Snapshot]:
     status = worker.status()
     assert not status.missing, status.missing
     assert status.rows == len(world.photo_ids), "every photo can be found"
-    snapshot = worker.snapshot(world.generation_id, world.version)
-    assert isinstance(snapshot, Snapshot)
-    return worker, snapshot
+    return worker, worker.snapshot(world.generation_id, world.version)
 
 
 def placewise_search(worker: SearchWorker, snapshot: Snapshot) -> SearchMethod:
