@@ -98,14 +98,20 @@ class HttpSearchClient:
         Workers that lag behind are called again until the time is over.
         """
         deadline = time.monotonic() + self._timeout_seconds
-        while True:
+        behind: Unavailable | None = None
+        while not self._stop.is_set():
             urls = self._workers.urls(request.generation_id, request.min_version)
             try:
                 return self._call_any(urls, "search", request, SearchResponse, deadline)
             except Unavailable as error:
-                retry = error.code == BEHIND and time.monotonic() + RETRY_PAUSE_SECONDS < deadline
-                if not retry or self._stop.wait(RETRY_PAUSE_SECONDS):
+                if error.code == BEHIND:  # a worker may answer in a moment
+                    behind = error
+                elif error.code != NO_ANSWER or behind is None:
                     raise
+            if time.monotonic() + RETRY_PAUSE_SECONDS > deadline:
+                raise behind
+            time.sleep(RETRY_PAUSE_SECONDS)
+        raise Unavailable(NO_ANSWER, "The server is stopping. Retry in a moment.")
 
     def match(self, request: MatchRequest) -> MatchResponse:
         """Match local features on one worker; on the next one when it fails."""
