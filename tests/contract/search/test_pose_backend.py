@@ -53,7 +53,7 @@ def backend(
     if request.param == "in process":
         yield SearchWorker(catalog, store, settings)
     else:
-        with SearchTier(catalog, store, settings, (1,)) as tier:
+        with SearchTier(catalog, store, settings, 1) as tier:
             yield tier.port
 
 
@@ -249,8 +249,8 @@ def test_next_worker_answers_when_one_is_down_and_the_metrics_count_poses(
     catalog: Catalog, store: FolderStore, settings: Settings, scene: ReconstructedScene
 ) -> None:
     request = pose_request(store, scene)
-    with SearchTier(catalog, store, settings, (1, 1)) as tier:
-        (first,), (second,) = tier.servers
+    with SearchTier(catalog, store, settings, 2) as tier:
+        first, second = tier.servers
         second.stop()
         for _ in range(3):  # the order of the workers is random
             found(tier.port.estimate_pose(request))
