@@ -23,6 +23,7 @@ from shared.storage import ObjectStore
 from shared.storage.keys import reconstruction_prefix
 
 MIN_PHOTOS = 3
+HOW = "`placewise reconstruct`, or Reconstruction under Advanced on the page"
 MAX_PHOTOS = 3000
 """Of a map that is reconstructed: the time of bundle adjustment grows faster than their number"""
 
@@ -162,8 +163,8 @@ def current_reconstruction(session: Session, map_id: UUID) -> Reconstruction | s
             return current
     other = session.scalar(finished)
     if other is None:
-        return "The map has no reconstruction yet. Make one: `placewise reconstruct`."
+        return f"The map has no reconstruction yet. Make one: {HOW}."
     return (
         f"The map's reconstruction is of local features of {other.features_model}, and the map now "
-        f"has {model or 'none'}. Make a new one: `placewise reconstruct`."
+        f"has {model or 'none'}. Make a new one: {HOW}."
     )
