@@ -9,9 +9,10 @@ from uuid import UUID
 import numpy as np
 import pytest
 
+from shared.errors import Unprocessable
 from shared.geometry.cameras import Camera, CameraSource
 from shared.geometry.component import Component
-from shared.geometry.localise import LocalPose, NoPose, localise
+from shared.geometry.localise import LocalPose, localise
 from shared.matching.features import FULL_SIDE, LocalFeatures
 from shared.matching.matchers import MutualNearest
 from tests.support.reconstructed_scene import CAMERA, ReconstructedScene, looking
@@ -30,18 +31,13 @@ def scene() -> ReconstructedScene:
     return ReconstructedScene()
 
 
-def found(outcome: LocalPose | NoPose) -> LocalPose:
-    assert isinstance(outcome, LocalPose), outcome
-    return outcome
-
-
 def locate(
     query: LocalFeatures,
     scene: ReconstructedScene,
     camera: Camera | None = None,
     component: Component | None = None,
     leave_out: frozenset[UUID] = frozenset(),
-) -> LocalPose | NoPose:
+) -> LocalPose:
     """Localise a photo, whose camera is given or estimated, among those of the scene."""
     source = CameraSource.GIVEN if camera else CameraSource.ESTIMATED
     components = [component or scene.component]
@@ -55,7 +51,7 @@ def test_photo_is_localised_with_a_third_of_wrong_matches(
 ) -> None:
     camera = replace(CAMERA, focal_pixels=focal)
     query, _ = scene.take(ROTATION, CENTRE, camera, wrong=0.3)
-    pose = found(locate(query, scene, camera if is_known else None))
+    pose = locate(query, scene, camera if is_known else None)
     assert pose.camera_source == (CameraSource.GIVEN if is_known else CameraSource.ESTIMATED)
     assert pose.component == 0
     assert np.linalg.norm(pose.position - CENTRE) < 0.2
@@ -71,7 +67,7 @@ def test_photo_is_localised_with_a_third_of_wrong_matches(
 def test_photo_of_another_size_is_localised(scene: ReconstructedScene) -> None:
     camera = Camera(1920, 1080, 1300.0, radial=-0.05)
     query, _ = scene.take(ROTATION, CENTRE, camera)
-    pose = found(locate(query, scene))
+    pose = locate(query, scene)
     assert np.linalg.norm(pose.position - CENTRE) < 0.5
 
 
@@ -82,7 +78,7 @@ def test_principal_point_and_distortion_of_a_query_are_estimated_with_its_pose(
     shift = round(0.005 * FULL_SIDE)  # turns a pose that does not know it by 0.4 degrees
     shifted = replace(query, positions=np.clip(np.add(query.positions, (shift, 0)), 0, FULL_SIDE))
     camera = Camera.of_focal_length(query.width, query.height, CAMERA.focal_length)
-    pose = found(locate(shifted, scene, camera))
+    pose = locate(shifted, scene, camera)
     assert angle_degrees(pose.rotation, ROTATION) < 0.2
     assert pose.camera.radial == pytest.approx(-0.04, abs=0.02)
 
@@ -91,7 +87,7 @@ def test_covariance_is_that_of_the_errors_of_many_queries(scene: ReconstructedSc
     squares = []
     for _ in range(60):
         query, _ = scene.take(ROTATION, CENTRE, wrong=0.3)
-        pose = found(locate(query, scene, CAMERA))
+        pose = locate(query, scene, CAMERA)
         turn = pose.rotation.T @ ROTATION
         error = np.concatenate([CENTRE - pose.position, [turn[1, 2], turn[2, 0], turn[0, 1]]])
         squares.append(error @ np.linalg.solve(pose.covariance, error))
@@ -102,17 +98,18 @@ def test_covariance_is_that_of_the_errors_of_many_queries(scene: ReconstructedSc
 def test_photos_that_are_left_out_are_not_used(scene: ReconstructedScene) -> None:
     photo, features = scene.candidates[2]
     everything = frozenset(scene.features)
-    outcome = locate(features, scene, CAMERA, leave_out=everything - {photo})
-    assert isinstance(outcome, NoPose)  # its own points, which no two others see
-    pose = found(locate(features, scene, CAMERA, leave_out=frozenset({photo})))
+    with pytest.raises(Unprocessable):  # its own points, which no two others see
+        locate(features, scene, CAMERA, leave_out=everything - {photo})
+    pose = locate(features, scene, CAMERA, leave_out=frozenset({photo}))
     assert np.linalg.norm(pose.position - scene.component.centres()[2]) < 0.2
 
 
 def test_photo_of_another_scene_has_no_pose(scene: ReconstructedScene) -> None:
     query, _ = ReconstructedScene(seed=1).take(ROTATION, CENTRE)
     assert reason(query, scene).endswith(".")
-    outcome = localise(query, [], [scene.component], None, CameraSource.ESTIMATED, MATCHER)
-    assert outcome == NoPose("None of the best photos of the map is in the model.")
+    rest = [scene.component], None, CameraSource.ESTIMATED, MATCHER
+    with pytest.raises(Unprocessable, match="None of the best photos of the map is in the model"):
+        localise(query, [], *rest)
 
 
 def keep(features: LocalFeatures, chosen: np.ndarray) -> LocalFeatures:
@@ -124,9 +121,9 @@ def keep(features: LocalFeatures, chosen: np.ndarray) -> LocalFeatures:
 
 
 def reason(query: LocalFeatures, scene: ReconstructedScene, **options: Any) -> str:
-    outcome = locate(query, scene, **options)
-    assert isinstance(outcome, NoPose), outcome
-    return outcome.reason
+    with pytest.raises(Unprocessable) as raised:
+        locate(query, scene, **options)
+    return raised.value.detail
 
 
 def test_few_points_in_a_corner_or_many_wrong_matches_are_no_pose(
@@ -148,7 +145,7 @@ def test_panorama_is_no_pose_unless_its_camera_is_given(scene: ReconstructedScen
     wide = Camera(1280, 640, 700.0)
     query, _ = scene.take(ROTATION, CENTRE, wide)
     assert "panorama" in reason(query, scene)
-    found(locate(query, scene, wide))
+    locate(query, scene, wide)
 
 
 def test_place_that_exists_twice_is_no_pose(scene: ReconstructedScene) -> None:
@@ -172,10 +169,10 @@ def test_place_that_exists_twice_is_no_pose(scene: ReconstructedScene) -> None:
         observations=np.tile(once.observations, 2),
     )
     candidates = [*scene.candidates, *((names[p], f) for p, f in scene.candidates)]
-    outcome = localise(query, candidates, [twice], CAMERA, CameraSource.GIVEN, MATCHER)
-    assert outcome == NoPose("Two places of the model explain the photo about equally well.")
+    with pytest.raises(Unprocessable, match="Two places of the model explain the photo"):
+        localise(query, candidates, [twice], CAMERA, CameraSource.GIVEN, MATCHER)
     # The photos of one of the two alone know no other place.
-    found(locate(query, scene, CAMERA, twice))
+    locate(query, scene, CAMERA, twice)
 
 
 def test_wrong_focal_length_is_a_reason(scene: ReconstructedScene) -> None:
@@ -209,4 +206,5 @@ def test_features_of_another_detection_are_ignored(scene: ReconstructedScene) ->
     query, _ = scene.take(ROTATION, CENTRE)
     fewer = [(p, keep(f, np.arange(len(f.positions) - 1))) for p, f in scene.candidates]
     source = CameraSource.GIVEN
-    assert isinstance(localise(query, fewer, [scene.component], CAMERA, source, MATCHER), NoPose)
+    with pytest.raises(Unprocessable):
+        localise(query, fewer, [scene.component], CAMERA, source, MATCHER)
