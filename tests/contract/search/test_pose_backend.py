@@ -175,17 +175,6 @@ def test_camera_of_an_imported_model_serves_queries_with_its_key_alone(
     assert np.linalg.norm(pose.position - CENTRE) < 0.05
 
 
-def test_component_without_alignment_or_calibration_has_a_pose_without_coordinates(
-    backend: SearchBackend, store: FolderStore, scene: ReconstructedScene
-) -> None:
-    for component in (
-        PoseComponent(object_key=COMPONENT_KEY, calibration=CALIBRATION),
-        PoseComponent(object_key=COMPONENT_KEY, alignment=ALIGNMENT),
-    ):
-        request = pose_request(store, scene, components=(component,))
-        assert found(backend.estimate_pose(request)).geographic is None
-
-
 @pytest.mark.parametrize(
     ("case", "reason"),
     [
