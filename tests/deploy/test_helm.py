@@ -228,6 +228,32 @@ def test_no_manifest_holds_a_secret_and_each_pod_gets_only_its_own(name: str) ->
     assert not set(settings) & set(SECRET_SETTINGS)
 
 
+def test_a_steward_with_an_immich_library_has_what_that_of_the_compose_file_has(
+    tmp_path: Path,
+) -> None:
+    passwords = (f"{name}_PASSWORD" for name in ("POSTGRES", "REDIS", "FLOWER", "GRAFANA"))
+    values = dict.fromkeys((*passwords, "ADMIN_KEY", "S3_ACCESS_KEY", "S3_SECRET_KEY"), "x")
+    compose = services(SERVICES, tmp_path, values)["steward"]["environment"]
+    names = {name for name in compose if name.startswith(("IMMICH_", "PLACEWISE_"))}
+    given = variables(by_component("production", "Deployment")["steward"])
+    assert names <= set(given)
+    assert not names & set(variables(by_component("cpu", "Deployment")["steward"]))
+    keys = {name: given[name]["valueFrom"]["secretKeyRef"] for name in names if "KEY" in name}
+    secret = "placewise-settings"
+    assert keys == {
+        "IMMICH_API_KEY": {"name": secret, "key": "IMMICH_API_KEY"},
+        "PLACEWISE_KEY": {"name": secret, "key": "ADMIN_KEY"},
+    }
+    gateway = by_component("production", "Service")["gateway"]
+    server = f"http://{gateway['metadata']['name']}"
+    assert gateway["spec"]["ports"][0]["port"] == 80
+    assert given["PLACEWISE_SERVER"]["value"] == server
+    policies = {one["metadata"]["name"]: one["spec"] for one in of_kind("production", "NetworkPolicy")}
+    *_, reached = policies[f"{RELEASE}-search-clients"]["egress"]
+    selector = reached["to"][0]["podSelector"]["matchLabels"]
+    assert selector == gateway["spec"]["selector"]
+
+
 def test_an_external_store_fills_the_secret_that_the_pods_read() -> None:
     (external,) = of_kind("production", "ExternalSecret")
     secret = external["spec"]["target"]["name"]
