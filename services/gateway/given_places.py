@@ -51,7 +51,12 @@ from shared.responses.reconstructions import (
     StoredProposalResponse,
     UndonePlacesResponse,
 )
-from shared.responses.similarity import PhotoResponse, SimilarityResponse, SimilarPhotoResponse
+from shared.responses.similarity import (
+    DeniedPlace,
+    PhotoResponse,
+    SimilarityResponse,
+    SimilarPhotoResponse,
+)
 from shared.search_api.photo_filter import Box, PhotoFilter
 
 WITH_COORDINATES = PhotoFilter(box=Box(south=-90, west=-180, north=90, east=180))
@@ -63,7 +68,7 @@ Label = Annotated[str, Field(max_length=MAX_TEXT_CHARACTERS, pattern=NO_NUL_PATT
 
 
 class GivenPlaceBody(FiniteModel):
-    """A place for one photo."""
+    """A place for one photo, or one where it was not taken."""
 
     file_id: UUID
     latitude: Latitude | None = None
@@ -74,6 +79,10 @@ class GivenPlaceBody(FiniteModel):
         None, description="of the proposal; omit it for a place that a person chose"
     )
     reason: str = Field("", max_length=MAX_TEXT_CHARACTERS, pattern=NO_NUL_PATTERN)
+    denied: bool = Field(
+        False, description="the photo was not taken there: it gets no place, and evaluations know"
+    )
+    radius_m: float | None = Field(None, gt=0, description="of the circle that is denied")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -89,6 +98,8 @@ class GivenPlaceBody(FiniteModel):
     def columns(self, photo: Photo) -> dict[str, Any]:
         """Return the columns that the place sets."""
         columns: dict[str, Any] = {}
+        if self.denied:
+            return columns
         if self.latitude is not None:
             columns |= {"latitude": self.latitude, "longitude": self.longitude}
         if self.heading is not None and photo.heading is None:
@@ -172,7 +183,9 @@ def search_for_place(gateway: GatewayContext, map_name: str, photo: Photo) -> Si
     )
 
 
-def _is_at(photo: SimilarPhotoResponse, proposal: Proposal | None, label: str | None) -> bool:
+def _is_at(
+    photo: SimilarPhotoResponse | DeniedPlace, proposal: Proposal | None, label: str | None
+) -> bool:
     """Return whether a photo has a place that a proposal, or else a label, speaks of."""
     if proposal is None:
         return label is not None and photo.place == label
@@ -219,6 +232,10 @@ def _propose_place(
         picture, similar = picture_evidence(answer, photo_count), answer.similar_images
         label, probability = probable_label(answer.estimate)
     proposal, reason = finder.propose(dated, picture)
+    denied = (photo.given_place or {}).get("denied")
+    if denied and _is_at(DeniedPlace(**denied), proposal, label):
+        proposal, label, probability = None, None, None
+        error = "A person said that it was not taken where it seems to be"
     if gps_error := (photo.capture or {}).get("gps_error"):
         proposal, label, probability = None, None, None
         error = f"It may have coordinates: {gps_error}"
@@ -256,6 +273,9 @@ def give_places(
                 "reason": place.reason,
                 "given_at": datetime.now(UTC).isoformat(),
             }
+            if place.denied:
+                named = {"latitude", "longitude", "radius_m", "place"}
+                photo.given_place["denied"] = place.model_dump(include=named)
             for name, value in written.items():
                 setattr(photo, name, value)
             photo.changed_version = version

@@ -21,10 +21,11 @@ from sqlalchemy.orm import Session
 from shared.catalog.chunks import Descriptor, find_descriptor, find_feature_rows
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
-from shared.catalog.photos import Photo, PhotoRole, is_geotagged
+from shared.catalog.photos import Photo, PhotoRole, has_given_place, is_geotagged
 from shared.config.shards import is_shard_name
 from shared.errors import Conflict, Gone, Unavailable
 from shared.evaluation.places.evidence import PhotoLocation, match_support
+from shared.evaluation.places.levels import CandidateLevel
 from shared.geodesy import distances_m, latitude_bounds
 from shared.search_api.photo_filter import PhotoFilter
 from shared.search_api.protocol import (
@@ -51,11 +52,20 @@ class GeotaggedPhoto:
     """its path in its folder, else its file name"""
     place_is_estimated: bool = False
     """whether its place is an accepted proposal"""
+    denied_radius_m: float | None = None
+    denied: bool = False
+    """whether it was not taken at `spot`, as a person said of an answer"""
     _name_parts: list[str] = field(init=False, compare=False)
     """text and digits of the name in turn"""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_name_parts", re.split(r"([0-9]+)", self.name))
+
+    def is_right(self, level: CandidateLevel) -> bool | None:
+        """Return whether the photo was taken in a level; None if that is not known."""
+        if self.denied:
+            return False if level.is_denied(self.spot, self.denied_radius_m) else None
+        return level.is_right(self.spot)
 
     def is_same_sequence(self, other: GeotaggedPhoto) -> bool:
         """Return whether two photos are frames of one walk, drive or video.
@@ -113,9 +123,15 @@ class GeotaggedPhotos:
 
 
 def read_geotagged_photos(
-    session: Session, map_id: UUID, generation_id: UUID, role: PhotoRole
+    session: Session, map_id: UUID, generation_id: UUID, role: PhotoRole | None
 ) -> list[GeotaggedPhoto]:
-    """Return the live geotagged photos of a role with a descriptor in the generation, by id."""
+    """Return the live geotagged photos of a role with a descriptor in the generation, by id.
+
+    None: photos without a place of which a person has denied one, at the denied place.
+    """
+    chosen = (Photo.role == role, is_geotagged())
+    if role is None:
+        chosen = (has_given_place(), ~is_geotagged())
     photos = session.execute(
         select(
             Photo.id,
@@ -131,21 +147,31 @@ def read_geotagged_photos(
             Photo.map_id == map_id,
             Descriptor.generation_id == generation_id,
             Photo.deleted_at.is_(None),
-            Photo.role == role,
-            is_geotagged(),
+            *chosen,
         )
         .order_by(Photo.id)
     )
-    return [
-        GeotaggedPhoto(
-            row[0],
-            PhotoLocation(*row[1:4]),
-            row[4],
-            row[5],
-            place_is_estimated=bool(row[6]) and row[6]["probability"] is not None,
+    found = []
+    for row in photos:
+        given = row[6] or {}
+        denied = None if role else given.get("denied")
+        if role is None and denied is None:  # its place was taken away since
+            continue
+        spot = PhotoLocation(*row[1:4])
+        if denied:
+            spot = PhotoLocation(denied["latitude"], denied["longitude"], denied["place"])
+        found.append(
+            GeotaggedPhoto(
+                row[0],
+                spot,
+                row[4],
+                row[5],
+                place_is_estimated=given.get("probability") is not None,
+                denied=denied is not None,
+                denied_radius_m=denied and denied["radius_m"],
+            )
         )
-        for row in photos
-    ]
+    return found
 
 
 MAX_READ_ATTEMPTS = 2

@@ -248,7 +248,9 @@ def test_a_steward_with_an_immich_library_has_what_that_of_the_compose_file_has(
     server = f"http://{gateway['metadata']['name']}"
     assert gateway["spec"]["ports"][0]["port"] == 80
     assert given["PLACEWISE_SERVER"]["value"] == server
-    policies = {one["metadata"]["name"]: one["spec"] for one in of_kind("production", "NetworkPolicy")}
+    policies = {
+        one["metadata"]["name"]: one["spec"] for one in of_kind("production", "NetworkPolicy")
+    }
     *_, reached = policies[f"{RELEASE}-search-clients"]["egress"]
     selector = reached["to"][0]["podSelector"]["matchLabels"]
     assert selector == gateway["spec"]["selector"]

@@ -97,6 +97,17 @@ class CandidateLevel:
         ends_above = self.is_path and bool(levels) and is_within_level(self.place, levels[0])
         return None if ends_above or not levels else False
 
+    def is_denied(self, denied: PhotoLocation, radius_m: float | None) -> bool:
+        """Return whether a photo that was not taken at the denied place is not in the level.
+
+        So it is if the level is the denied one, a finer one of its path, or a circle that contains
+        its position and is no larger.
+        """
+        if self.radius_m is not None:
+            return radius_m is not None and self.radius_m <= radius_m and self.contains(denied)
+        of_level = PhotoLocation(None, None, self.place)
+        return denied.place is not None and replace(self, place=denied.place).contains(of_level)
+
 
 def candidate_levels(
     ranking: Sequence[RankedPhoto],
