@@ -55,10 +55,11 @@ from services.extractor.geometry.evidence import fit_to_positions
 from services.extractor.geometry.mapping import PhotoToMap, map_photos, require_pycolmap
 from services.extractor.geometry.matching import match_pairs
 from services.extractor.geometry.pairs import choose_pairs
+from shared.errors import Unprocessable
 from shared.geometry.absolute_pose import estimate_absolute_pose
 from shared.geometry.cameras import Camera, CameraSource, Floats
 from shared.geometry.frames import Alignment, EastNorthUp, align
-from shared.geometry.localise import LocalPose, NoPose, localise
+from shared.geometry.localise import LocalPose, localise
 from shared.geometry.radius import PoseCalibration, geo_pose
 from shared.matching.detectors import load_detector
 from shared.matching.features import LocalFeatures
@@ -78,7 +79,7 @@ PLANE = EastNorthUp(44.07, 8.75)
 WRONG_RADII = 3.0
 """A pose is wrong if it is farther off than so many of its radii of 95 %"""
 
-Outcome = LocalPose | NoPose
+Outcome = LocalPose | None
 
 
 class Vlad:
@@ -155,9 +156,14 @@ class MappedPhotos:
         camera = focal_length and Camera.of_focal_length(query.width, query.height, focal_length)
         source = CameraSource.GIVEN if camera else CameraSource.ESTIMATED
         started = time.perf_counter()
-        found = localise(query, candidates, self.components, camera or None, source, self.matcher)
-        self.pose_seconds.append(time.perf_counter() - started)
-        return found
+        try:
+            return localise(
+                query, candidates, self.components, camera or None, source, self.matcher
+            )
+        except Unprocessable:
+            return None
+        finally:
+            self.pose_seconds.append(time.perf_counter() - started)
 
     def localise_by_another_lens(self, query: LocalFeatures, camera: CityCamera) -> Outcome:
         """Localise a photo of an ideal camera as a real lens would have taken it."""
@@ -512,14 +518,12 @@ def _align(mapped: MappedPhotos, truth: Floats) -> Alignment:
     component = mapped.components[0]
     rows = sorted(range(len(component.photo_ids)), key=lambda row: component.photo_ids[row])
     numbers = [mapped.ids.index(component.photo_ids[row]) for row in rows]
-    found = align(
+    return align(
         component.centres()[rows],
         [component.rotation(row) for row in rows],
         *_coordinates(truth[numbers]),
         np.full(len(rows), COORDINATE_NOISE_M),
     )
-    assert isinstance(found, Alignment), found
-    return found
 
 
 def _coordinates(metres: Floats) -> tuple[Floats, Floats, Floats]:

@@ -18,7 +18,7 @@ from shared.catalog.chunks import find_descriptor_rows, find_features_model
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import Map, Matching
-from shared.catalog.reconstructions import Reconstruction, current_reconstruction
+from shared.catalog.reconstructions import find_reconstruction
 from shared.errors import Misconfigured, NotFound
 from shared.imaging.decode import DecodedPhoto
 from shared.jobs import Job, JobKind
@@ -80,14 +80,16 @@ def prepare_features(
         matching = session.get_one(Map, batch.jobs[0].map_id).matching
         model = find_features_model(session, target.generation.id)
         source = active_generation(session, batch.jobs[0].map_id)
-        is_reconstructed = is_query and isinstance(
-            current_reconstruction(session, batch.jobs[0].map_id), Reconstruction
-        )
+        reconstruction = find_reconstruction(session, batch.jobs[0].map_id) if is_query else None
     uses_matches = target.generation.uses_matches
     if matching == Matching.OFF:
         return None
     if is_query:
-        missing = {job.id for job in batch.jobs if _is_matched(job, uses_matches, is_reconstructed)}
+        missing = {
+            job.id
+            for job in batch.jobs
+            if _is_matched(job, uses_matches, reconstruction is not None)
+        }
     elif matching == Matching.ON or uses_matches is not False:
         missing = {job.id for job in batch.jobs}
     else:

@@ -65,6 +65,6 @@ def _admin_key_hashes(settings: Settings, catalog: Catalog) -> list[str]:
             return []
     raise Misconfigured(
         "admin_key_missing",
-        "Every call requires a key, but no admin key exists. Create one (placewise keys create "
-        "NAME --scope admin), or set ADMIN_KEY (generate it with openssl rand -hex 24).",
+        "Every call requires a key, but no admin key exists. Set ADMIN_KEY (generate it with "
+        "openssl rand -hex 24).",
     )

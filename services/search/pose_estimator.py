@@ -14,11 +14,11 @@ import numpy as np
 from cachetools import LRUCache, cachedmethod
 
 from services.search.photo_matcher import PhotoMatcher, match_threads, unusable_query_reason
-from shared.errors import NotFound
+from shared.errors import NotFound, Unprocessable
 from shared.geometry.cameras import Camera, CameraSource, hash_camera_key
 from shared.geometry.component import Component, quaternion_of
 from shared.geometry.frames import EastNorthUp, Similarity
-from shared.geometry.localise import LocalPose, NoPose, localise
+from shared.geometry.localise import LocalPose, localise
 from shared.geometry.radius import PoseCalibration, geo_pose
 from shared.matching.features import LocalFeatures
 from shared.matching.matchers import MutualNearest
@@ -92,11 +92,11 @@ class PoseEstimator:
                 MutualNearest.of_model(request.features_model),
                 frozenset(request.leave_out),
             )
+        except Unprocessable as error:
+            return PoseResponse(reason=error.detail)
         except np.linalg.LinAlgError as error:  # the search itself has an answer
             log.warning("a pose can't be computed: %s", error)
             return PoseResponse(reason="The points of the model that match determine no position.")
-        if isinstance(pose, NoPose):
-            return PoseResponse(reason=pose.reason)
         number = list(components)[pose.component]
         return PoseResponse(pose=_to_message(pose, number, request.components[number]))
 

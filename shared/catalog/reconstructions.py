@@ -17,7 +17,7 @@ from sqlalchemy.orm import Mapped, Session, mapped_column
 from shared.catalog.chunks import count_searchable, find_features_model
 from shared.catalog.database.base import Base, Journaled, JsonValue, UtcDateTime, db_now
 from shared.catalog.generations import Generation, active_generation
-from shared.errors import Conflict
+from shared.errors import Conflict, NotFound
 from shared.ids import new_id
 from shared.storage import ObjectStore
 from shared.storage.keys import reconstruction_prefix
@@ -106,8 +106,8 @@ class Reconstruction(Journaled, Base):
 
 def gives_coordinates(session: Session, map_id: UUID) -> bool:
     """Return whether poses in the map have coordinates and radii, at least in a component."""
-    current = current_reconstruction(session, map_id)
-    return isinstance(current, Reconstruction) and any(
+    current = find_reconstruction(session, map_id)
+    return current is not None and any(
         each.alignment and each.calibration for each in current.list_components()
     )
 
@@ -143,27 +143,35 @@ def check_reconstructable(session: Session, map_id: UUID) -> tuple[Generation, s
     return active, model
 
 
-def current_reconstruction(session: Session, map_id: UUID) -> Reconstruction | str:
-    """Return the reconstruction for queries of the map now, or why there is none, as a sentence.
+def find_reconstruction(session: Session, map_id: UUID) -> Reconstruction | None:
+    """Return the reconstruction for queries of the map now.
 
     It is the newest finished one for the local features of the active generation.
     """
-    finished = (
-        sa.select(Reconstruction)
-        .where(Reconstruction.map_id == map_id, Reconstruction.finished_at.is_not(None))
-        .order_by(Reconstruction.id.desc())
-        .limit(1)
-    )
+    model = _features_model(session, map_id)
+    finished = _newest_finished(map_id).where(Reconstruction.features_model == model)
+    return None if model is None else session.scalar(finished)
+
+
+def get_reconstruction(session: Session, map_id: UUID) -> Reconstruction:
+    """Return `find_reconstruction`; NotFound (`no_reconstruction`) says why there is none."""
+    if (current := find_reconstruction(session, map_id)) is not None:
+        return current
+    reason = "The map has no reconstruction yet. Make one: `placewise reconstruct`."
+    if (other := session.scalar(_newest_finished(map_id))) is not None:
+        reason = (
+            f"The map's reconstruction is of local features of {other.features_model}, and the map "
+            f"now has {_features_model(session, map_id) or 'none'}. Make a new one: `placewise "
+            "reconstruct`."
+        )
+    raise NotFound("no_reconstruction", reason)
+
+
+def _newest_finished(map_id: UUID) -> sa.Select[Reconstruction]:
+    finished = Reconstruction.map_id == map_id, Reconstruction.finished_at.is_not(None)
+    return sa.select(Reconstruction).where(*finished).order_by(Reconstruction.id.desc()).limit(1)
+
+
+def _features_model(session: Session, map_id: UUID) -> str | None:
     active = active_generation(session, map_id)
-    model = None if active is None else find_features_model(session, active.id)
-    if model is not None:
-        current = session.scalar(finished.where(Reconstruction.features_model == model))
-        if current is not None:
-            return current
-    other = session.scalar(finished)
-    if other is None:
-        return "The map has no reconstruction yet. Make one: `placewise reconstruct`."
-    return (
-        f"The map's reconstruction is of local features of {other.features_model}, and the map now "
-        f"has {model or 'none'}. Make a new one: `placewise reconstruct`."
-    )
+    return None if active is None else find_features_model(session, active.id)

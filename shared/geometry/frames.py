@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymap3d import ecef2geodetic, enu2geodetic, geodetic2ecef, geodetic2enu
 
+from shared.errors import Unprocessable
 from shared.geometry.cameras import Floats
 
 MIN_PHOTOS = 3
@@ -164,8 +165,8 @@ def align(
     longitudes: Floats,
     altitudes_m: Floats,
     sigmas_m: Floats,
-) -> Alignment | str:
-    """Align a component with the coordinates of its photos, or say in words why that is impossible.
+) -> Alignment:
+    """Align a component with its photos' coordinates; Unprocessable (`not_aligned`) says why not.
 
     The similarity minimises the squared distances over `sigmas_m`, each at most INLIER_SIGMAS of
     the noise that the photos show, and the squared angles by which cameras lean to a side over
@@ -182,7 +183,10 @@ def align(
     """
     known = np.flatnonzero(np.isfinite(latitudes) & np.isfinite(longitudes))
     if len(known) < MIN_PHOTOS:
-        return f"{len(known)} of its photos have coordinates, and {MIN_PHOTOS} are needed"
+        raise Unprocessable(
+            "not_aligned",
+            f"{len(known)} of its photos have coordinates, and {MIN_PHOTOS} are needed.",
+        )
     altitudes = altitudes_m[known]
     knows_altitude = bool(np.isfinite(altitudes).sum() >= MIN_PHOTOS)
     middle = float(np.nanmedian(altitudes)) if knows_altitude else 0.0
@@ -194,12 +198,10 @@ def align(
     sigmas = np.repeat(sigmas_m[known, None], 3, axis=1)
     sigmas[~is_high, 2] = np.hypot(sigmas[~is_high, 2], UNKNOWN_ALTITUDE_SIGMA_M)
     points = centres[known]
-    fitted = fit_similarity(
+    similarity, is_near = fit_similarity(
         points, targets, [rotations[i] for i in known.tolist()], sigmas, knows_altitude
     )
-    if isinstance(fitted, str):
-        return fitted
-    residuals = targets - fitted[0].apply(points)
+    residuals = targets - similarity.apply(points)
     distances = np.full(len(centres), np.nan)
     distances[known] = np.linalg.norm(residuals[:, :2], axis=1)
     typical = float(np.median(distances[known] / sigmas_m[known]))
@@ -207,23 +209,28 @@ def align(
     middle_distance = float(np.nanmedian(distances))
     scatters = spread > 2 * np.median(sigmas_m[known]) and middle_distance > spread / 2
     if typical > MAX_TYPICAL_ERROR or scatters:
-        return (
-            f"half of its photos are {middle_distance:.0f} m or more from their coordinates: these "
-            "or the reconstruction are wrong"
+        raise Unprocessable(
+            "not_aligned",
+            f"Half of its photos are {middle_distance:.0f} m or more from their coordinates: these "
+            "or the reconstruction are wrong.",
         )
-    if fitted[0].covariance[6, 6] > MAX_SCALE_SIGMA**2:
-        return "its photos are too close to each other for the errors of their coordinates"
+    if similarity.covariance[6, 6] > MAX_SCALE_SIGMA**2:
+        raise Unprocessable(
+            "not_aligned",
+            "Its photos are too close to each other for the errors of their coordinates.",
+        )
     agrees = np.zeros(len(centres), dtype=bool)
-    agrees[known] = fitted[1]
+    agrees[known] = is_near
     near = int(np.sum(distances[known] <= INLIER_SIGMAS * sigmas_m[known]))
     if max(near, agrees.sum()) < MIN_AGREEING_SHARE * len(known):
-        return (
-            f"only {near} of {len(known)} photos agree with their coordinates: the reconstruction "
-            "is bent, or many coordinates are wrong"
+        raise Unprocessable(
+            "not_aligned",
+            f"Only {near} of {len(known)} photos agree with their coordinates: the reconstruction "
+            "is bent, or many coordinates are wrong.",
         )
     rms = float(np.sqrt(np.mean(distances[agrees] ** 2)))
     is_on_line = _is_on_line(points) or _is_on_line(targets[:, :2])
-    return Alignment(origin, fitted[0], rms, distances, agrees, is_on_line)
+    return Alignment(origin, similarity, rms, distances, agrees, is_on_line)
 
 
 def align_at(
@@ -247,8 +254,8 @@ def fit_similarity(
     rotations: Sequence[Floats],
     sigmas: Floats,
     knows_altitude: bool,
-) -> tuple[Similarity, NDArray[np.bool_]] | str:
-    """Return the similarity of `align`, and which photos agree with it; or why there is none.
+) -> tuple[Similarity, NDArray[np.bool_]]:
+    """Return the similarity of `align`, and which photos agree with it.
 
     Args:
         points: (n, 3) positions in the component, in the order in which they were taken.
@@ -258,7 +265,7 @@ def fit_similarity(
     """
     for what, places in (("coordinates", targets[:, :2]), ("reconstructed positions", points)):
         if np.ptp(places, axis=0).max() <= np.abs(places).max() * 1e-9:
-            return f"the {what} of its photos are all the same"
+            raise Unprocessable("not_aligned", f"The {what} of its photos are all the same.")
     axes = np.array(rotations)
     on_line = _is_on_line(points) or _is_on_line(targets[:, :2])
     level = _level(axes) if on_line else None

@@ -10,6 +10,7 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.errors import Unprocessable
 from shared.geometry.absolute_pose import AbsolutePose, LensSigmas, estimate_absolute_pose
 from shared.geometry.cameras import Camera, CameraSource, Floats
 from shared.geometry.component import Component
@@ -71,14 +72,6 @@ class LocalPose:
 
 
 @dataclass(frozen=True, slots=True)
-class NoPose:
-    """Why a photo has no pose."""
-
-    reason: str
-    """a sentence"""
-
-
-@dataclass(frozen=True, slots=True)
 class _Pairs:
     """Keypoints of the query with the points of one component that they may be."""
 
@@ -102,8 +95,8 @@ def localise(
     camera_source: CameraSource,
     matcher: Matcher,
     leave_out: AbstractSet[UUID] = frozenset(),
-) -> LocalPose | NoPose:
-    """Return the pose of a photo, or the reason why it has none.
+) -> LocalPose:
+    """Return the pose of a photo; Unprocessable (`no_pose`) says why it has none.
 
     Args:
         query: Local features of the photo.
@@ -117,10 +110,12 @@ def localise(
     """
     longer, shorter = max(query.width, query.height), min(query.width, query.height)
     if longer >= PANORAMA_RATIO * shorter and camera_source != CameraSource.GIVEN:
-        return NoPose("The photo has the shape of a panorama, which no pinhole camera takes.")
+        raise Unprocessable(
+            "no_pose", "The photo has the shape of a panorama, which no pinhole camera takes."
+        )
     places = _candidates_in(components, candidates, leave_out)
     if not places:
-        return NoPose("None of the best photos of the map is in the model.")
+        raise Unprocessable("no_pose", "None of the best photos of the map is in the model.")
     pixels = query.pixels() if camera is None else camera.undistort(query.pixels())
     groups = [
         _match(query, pixels, group, components, matcher, leave_out)
@@ -135,16 +130,17 @@ def localise(
     found.sort(key=lambda each: -each[0].keypoints(each[1]))
     count = found[0][0].keypoints(found[0][1]) if found else 0
     if count < MIN_INLIERS:
-        return NoPose(
+        raise Unprocessable(
+            "no_pose",
             f"{count} points of the model agree with one position of the camera, and {MIN_INLIERS} "
-            "are needed."
+            "are needed.",
         )
     pairs, pose = found[0]
     reason = _doubt(pairs, pose, components, found[1:])
     if not reason and source in FOCAL_SIGMAS:
         reason = _doubt_focal_length(pairs, pose, components, source)
     if reason:
-        return NoPose(reason)
+        raise Unprocessable("no_pose", reason)
     return LocalPose(
         pairs.component,
         pose.rotation,

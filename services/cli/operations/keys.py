@@ -1,22 +1,15 @@
-"""`placewise keys`: create, list and revoke API keys.
-
-With `--server`, the commands call the HTTP API. Without it, they access the catalog directly
-(DATABASE_URL or PLACEWISE_HOME) and require no key, since write access to the catalog already
-implies full control. This is how the first admin key is created.
-"""
+"""`placewise keys`: create, list and revoke API keys of a server."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Collection, Iterator, Sequence
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Collection, Sequence
+from typing import Annotated
 from uuid import UUID
 
 import typer
 
 from placewise.answers import Key
-from placewise.client import Client
-from services.cli.environment import read_settings
+from services.cli.client import connect
 from services.cli.output import (
     JsonOption,
     KeyOption,
@@ -28,9 +21,6 @@ from services.cli.output import (
 )
 from shared.errors import Conflict, NotFound
 from shared.security.api_keys import Scope
-
-if TYPE_CHECKING:
-    from services.cli.operations.catalog_keys import CatalogKeys
 
 app = typer.Typer(help="Manage API keys: their scopes, limits and expiry.")
 
@@ -71,10 +61,10 @@ def create(
         "upload_bytes_per_day": upload_bytes_per_day,
         "max_photos": max_photos,
     }
-    with _open_keys(server, key) as keys:
+    with connect(server, None, key) as client:
         if maps:
-            _check_maps(maps, [each.name for each in keys.maps()])
-        created = keys.create_key(name, list(scope), days=days, maps=maps or None, **limits)
+            _check_maps(maps, [each.name for each in client.maps()])
+        created = client.create_key(name, list(scope), days=days, maps=maps or None, **limits)
     if as_json:
         print_json(created)
         return
@@ -86,8 +76,8 @@ def create(
 @app.command("list")
 def list_(server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False) -> None:
     """List all keys, including revoked and expired ones, without their secrets."""
-    with _open_keys(server, key) as keys:
-        listed = keys.keys()
+    with connect(server, None, key) as client:
+        listed = client.keys()
     if as_json:
         print_json(listed)
         return
@@ -113,8 +103,8 @@ def revoke(
     as_json: JsonOption = False,
 ) -> None:
     """Revoke a key with immediate effect."""
-    with _open_keys(server, key) as keys:
-        revoked = keys.revoke_key(_resolve_key_id(which, keys.keys()))
+    with connect(server, None, key) as client:
+        revoked = client.revoke_key(_resolve_key_id(which, client.keys()))
     print_result(revoked, as_json, f"Revoked key {revoked.prefix}... ({revoked.name}).")
 
 
@@ -129,19 +119,6 @@ def _check_maps(names: Sequence[str], existing: Collection[str]) -> None:
             "for all maps has no --map.",
             map=missing[0],
         )
-
-
-@contextlib.contextmanager
-def _open_keys(server: str | None, key: str | None) -> Iterator[Client | CatalogKeys]:
-    """Connect to a server, or open the catalog if none is given."""
-    if server:
-        with Client(server, key=key) as client:
-            yield client
-        return
-    from services.cli.operations.catalog_keys import open_catalog_keys  # needs the database
-
-    with open_catalog_keys(read_settings()) as keys:
-        yield keys
 
 
 def _resolve_key_id(id_or_prefix: str, keys: list[Key]) -> UUID:

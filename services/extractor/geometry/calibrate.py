@@ -17,6 +17,7 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.errors import Unprocessable
 from shared.geometry.cameras import Camera, CameraSource, Floats
 from shared.geometry.component import Component, bounded_inverse, projection_jacobian
 from shared.geometry.frames import MIN_AGREEING_SHARE, Alignment, Similarity
@@ -135,15 +136,16 @@ def localise_left_out(
         similarities = np.where(near, -np.inf, descriptors @ descriptors[row])
         best = np.argsort(-similarities, kind="stable")[: min(CANDIDATES, int((~near).sum()))]
         photo = component.photo_ids[row]
-        found = localise(
-            _as_another_photo(component, row, features[photo], by_another_lens=not knows_lens),
-            [(component.photo_ids[i], features[component.photo_ids[i]]) for i in best.tolist()],
-            [_without(component, np.flatnonzero(near), features)],
-            *photos.query_camera(row, knows_lens),
-            matcher,
-            frozenset(component.photo_ids[i] for i in np.flatnonzero(near).tolist()),
-        )
-        if not isinstance(found, LocalPose):
+        try:
+            found = localise(
+                _as_another_photo(component, row, features[photo], by_another_lens=not knows_lens),
+                [(component.photo_ids[i], features[component.photo_ids[i]]) for i in best.tolist()],
+                [_without(component, np.flatnonzero(near), features)],
+                *photos.query_camera(row, knows_lens),
+                matcher,
+                frozenset(component.photo_ids[i] for i in np.flatnonzero(near).tolist()),
+            )
+        except Unprocessable:
             return None
         return _compare(component, row, found, photos.similarity)
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.extractor.geometry.matching import VerifiedMatches
+from shared.errors import Unprocessable
 from shared.geometry.cameras import Floats
 from shared.geometry.frames import GPS_SIGMA_M, UNKNOWN_ALTITUDE_SIGMA_M, Similarity, fit_similarity
 
@@ -236,8 +237,10 @@ def fit_to_positions(
     sigmas[np.isnan(positions[:, 2]), 2] = UNKNOWN_ALTITUDE_SIGMA_M
     has_altitudes = bool(np.isfinite(positions[:, 2]).any())
     targets = with_heights(positions)
-    fitted = fit_similarity(centres, targets, rotations, sigmas, has_altitudes)
-    return None if isinstance(fitted, str) else fitted[0]
+    try:
+        return fit_similarity(centres, targets, rotations, sigmas, has_altitudes)[0]
+    except Unprocessable:
+        return None
 
 
 def with_heights(positions: Floats) -> Floats:

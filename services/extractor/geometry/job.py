@@ -53,7 +53,7 @@ from shared.catalog.reconstructions import (
     ReconstructedComponent,
     Reconstruction,
     check_reconstructable,
-    current_reconstruction,
+    find_reconstruction,
 )
 from shared.errors import NotFound, Unprocessable
 from shared.geometry.cameras import Floats, Rays, hash_camera_key
@@ -239,8 +239,8 @@ class ReconstructionJob:
         if self._job.params["from_scratch"]:
             return None
         with self._catalog.read() as session:
-            current = current_reconstruction(session, self._job.map_id)
-        if isinstance(current, str):
+            current = find_reconstruction(session, self._job.map_id)
+        if current is None:
             return None
         for stored in current.list_components():
             component = Component.decode(self._store.get(stored.object_key))
@@ -373,15 +373,23 @@ class ReconstructionJob:
     ) -> None:
         """Align and calibrate the components, and finish row and job in one transaction."""
         self._progress.update(MAPPED, "align")
-        alignments = [_align(component, photos, origin) for component in components]
+        alignments, not_aligned = list[Alignment | None](), list[str | None]()
+        for component in components:
+            try:
+                alignments.append(_align(component, photos, origin))
+                not_aligned.append(None)
+            except Unprocessable as error:
+                alignments.append(None)
+                not_aligned.append(error.detail)
         calibrations = self._calibrate(made, components, alignments, photos)
         stored, proposals = [], list[dict[str, Any]]()
-        for about, component, alignment, calibration in zip(
-            made.list_components(), components, alignments, calibrations, strict=True
+        for about, component, alignment, reason, calibration in zip(
+            made.list_components(), components, alignments, not_aligned, calibrations, strict=True
         ):
-            about = about.model_copy(update={"calibration": calibration.model_dump()})
-            if isinstance(alignment, str):
-                stored.append(about.model_copy(update={"not_aligned": alignment}))
+            update = {"calibration": calibration.model_dump(), "not_aligned": reason}
+            about = about.model_copy(update=update)
+            if alignment is None:
+                stored.append(about)
                 continue
             origin = alignment.origin
             aligned = ComponentAlignment(
@@ -420,7 +428,7 @@ class ReconstructionJob:
         self,
         made: Reconstruction,
         components: list[Component],
-        alignments: list[Alignment | str],
+        alignments: list[Alignment | None],
         photos: dict[UUID, MapPhoto],
     ) -> list[PoseCalibration]:
         def report(share: float) -> None:
@@ -436,7 +444,7 @@ class ReconstructionJob:
                 np.array([photo.descriptor for photo in of_component], np.float32),
                 _seconds(of_component),
                 [photo.row.focal_length for photo in of_component],
-                None if isinstance(alignment, str) else alignment.similarity,
+                None if alignment is None else alignment.similarity,
             )
             parts.append(part)
         matcher = MutualNearest.of_model(made.features_model)
@@ -457,8 +465,8 @@ class ReconstructionJob:
 
 def _align(
     component: Component, photos: Mapping[UUID, MapPhoto], origin: EastNorthUp | None
-) -> Alignment | str:
-    """Return the alignment of a component to its photos' coordinates, or why there is none.
+) -> Alignment:
+    """Return the alignment of a component to its photos' coordinates; raises as `align` does.
 
     The fit takes the photos in the order in which they were taken; the alignment has them in the
     component's.
@@ -479,8 +487,6 @@ def _align(
         _numbers(row.altitude for row in rows),
         np.full(len(rows), GPS_SIGMA_M),
     )
-    if isinstance(found, str):
-        return f"{found[0].upper()}{found[1:]}."
     back = np.argsort(order)
     return replace(found, residuals_m=found.residuals_m[back], is_inlier=found.is_inlier[back])
 

@@ -28,7 +28,7 @@ from shared.catalog.reconstructions import (
     ReconstructedComponent,
     Reconstruction,
     check_reconstructable,
-    current_reconstruction,
+    get_reconstruction,
 )
 from shared.errors import Conflict, NotFound
 from shared.geodesy import distance_m
@@ -178,9 +178,7 @@ def read_reconstruction(gateway: GatewayDep, query: MapQuery) -> ReconstructionR
     has now.
     """
     with gateway.catalog.read() as session:
-        found = current_reconstruction(session, get_map(session, query.map).id)
-        if isinstance(found, str):
-            raise NotFound("no_reconstruction", found)
+        found = get_reconstruction(session, get_map(session, query.map).id)
         return ReconstructionResponse.of_row(
             found,
             components=list(map(_component_response, found.list_components())),

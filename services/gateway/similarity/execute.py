@@ -41,13 +41,12 @@ from shared.catalog.maps import (
 )
 from shared.catalog.photos import Photo, get_live_photos, get_photo
 from shared.catalog.vocabularies import vocabulary_standing
-from shared.errors import Conflict, Gone, StorageFull
+from shared.errors import Conflict, Gone, PlacewiseError, StorageFull
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH, RankedPhoto
 from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import ELSEWHERE_SHARE, PlaceModel
 from shared.jobs import Job, JobState
 from shared.responses.similarity import (
-    CameraPoseResponse,
     EstimateResponse,
     SimilarityResponse,
     SimilarPhotoResponse,
@@ -196,9 +195,13 @@ def run_similarity_search(
     matches = _match_best_photos(search, rankings, search_params)
     estimate, probabilities = _estimate(search, rankings, matches, search_params)
     candidates = _pose_candidates(search, rankings, search_params)
-    pose = find_pose(gateway, query, candidates, search_params, estimate)
+    pose = no_pose = None
+    try:
+        pose = find_pose(gateway, query, candidates, search_params, estimate)
+    except PlacewiseError as error:
+        no_pose = error.detail
     similar = rankings.similar
-    if isinstance(pose, CameraPoseResponse):
+    if pose is not None:
         estimate = place_at_pose(estimate, pose)
     hits = matches.rerank(similar.hits, search_params.rerank or 0)[: search_params.top_k]
     images = [
@@ -223,8 +226,8 @@ def run_similarity_search(
         matches_without_place=sum(one.latitude is None and one.place is None for one in images),
         estimate=estimate,
         matches=matches.response,
-        pose=None if isinstance(pose, str) else pose,
-        no_pose=pose if isinstance(pose, str) else None,
+        pose=pose,
+        no_pose=no_pose,
         vocabulary=query.vocabulary,
         generation_id=query.generation.id,
         rows=RowType(query.generation.row_type),

@@ -14,8 +14,8 @@ from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import find_feature_rows
 from shared.catalog.maps import Matching
 from shared.catalog.photos import Photo
-from shared.catalog.reconstructions import ReconstructedComponent, current_reconstruction
-from shared.errors import PlacewiseError
+from shared.catalog.reconstructions import ReconstructedComponent, get_reconstruction
+from shared.errors import PlacewiseError, Unprocessable
 from shared.geometry.cameras import CameraSource
 from shared.responses.similarity import CameraPoseResponse, EstimateResponse, PoseCameraResponse
 from shared.search_api.protocol import (
@@ -47,8 +47,11 @@ def find_pose(
     hits: Sequence[SearchHit],
     search_params: SearchParams,
     estimate: EstimateResponse | None = None,
-) -> CameraPoseResponse | str | None:
-    """Return the pose of a query, or why it has none, as a sentence; None if it was not requested.
+) -> CameraPoseResponse | None:
+    """Return the pose of a query; None if it was not requested.
+
+    A query without one raises PlacewiseError, whose detail is a sentence: Unprocessable
+    (`no_pose`), NotFound (`no_reconstruction`), or what the search raises.
 
     Args:
         hits: The most similar photos, best first.
@@ -61,19 +64,19 @@ def find_pose(
         return None
     against = estimate if estimate and estimate.in_map is False else None
     if against and against.levels[0].radius_m is None:
-        return (
+        raise Unprocessable(
+            "no_pose",
             "The place is probably not in this map, and places that are built alike agree in their "
-            "points. Add photos of it, and run `placewise reconstruct`."
+            "points. Add photos of it, and run `placewise reconstruct`.",
         )
     if query.map.matching == Matching.OFF:
-        return (
+        raise Unprocessable(
+            "no_pose",
             "The map has no local features: its `matching` is off. Turn it on (`placewise maps "
-            f"update {query.map.name} --matching on`), then run `placewise reconstruct`."
+            f"update {query.map.name} --matching on`), then run `placewise reconstruct`.",
         )
     with gateway.catalog.read() as session:
-        current = current_reconstruction(session, query.map.id)
-        if isinstance(current, str):
-            return current
+        current = get_reconstruction(session, query.map.id)
         ids = [hit.photo_id for hit in hits]
         rows = find_feature_rows(session, query.generation.id, ids)
         stored = select(Photo.id, Photo.focal_length).where(Photo.id.in_(ids))
@@ -105,14 +108,15 @@ def find_pose(
         found = gateway.search.estimate_pose(request)
     except PlacewiseError as error:
         log.warning("a query is answered without a pose: %s", error)
-        return error.detail
+        raise
     if found.pose is None:
-        return found.reason or "The query has no pose."
+        raise Unprocessable("no_pose", found.reason or "The query has no pose.")
     if against and found.pose.inliers < (needed := _points_against(against)):
-        return (
+        raise Unprocessable(
+            "no_pose",
             f"{found.pose.inliers} points agree with a position, but the place is probably not "
             f"in this map: {needed} would be needed. Add photos of it, and run `placewise "
-            "reconstruct`."
+            "reconstruct`.",
         )
     return _to_response(found.pose, components[found.pose.component])
 

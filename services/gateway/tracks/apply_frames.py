@@ -46,7 +46,6 @@ from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
 from shared.geodesy import distances_m
 from shared.jobs import Job, JobState
 from shared.jobs.transitions import requeue_job_as_new
-from shared.responses.similarity import CameraPoseResponse
 from shared.responses.tracks import TrackStateResponse
 from shared.search_api.background import background_frames
 from shared.search_api.protocol import MAX_MATCHED_PHOTOS, RowReference, SearchHit
@@ -158,8 +157,11 @@ def _pose_fix(
 ) -> PositionFix | None:
     """Return where the frame's pose is, if it was requested and has coordinates."""
     first = hits[:MAX_MATCHED_PHOTOS]
-    pose = find_pose(gateway, query, first, query_job_search_params(job))
-    if not isinstance(pose, CameraPoseResponse) or pose.radius_68_m is None:
+    try:
+        pose = find_pose(gateway, query, first, query_job_search_params(job))
+    except PlacewiseError:
+        return None
+    if pose is None or pose.radius_68_m is None:
         return None
     assert pose.latitude is not None
     assert pose.longitude is not None

@@ -19,7 +19,7 @@ from services.extractor.worker import ExtractorWorker
 from shared.catalog.jobs import Job, JobKind, JobState
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
-from shared.catalog.reconstructions import Reconstruction, current_reconstruction
+from shared.catalog.reconstructions import Reconstruction, get_reconstruction
 from shared.errors import Unavailable
 from shared.geodesy import distance_m
 from shared.geometry.component import Component, quaternion_of
@@ -87,9 +87,7 @@ class Walk:
 
     def current(self) -> Reconstruction:
         with self.service.catalog.read() as session:
-            found = current_reconstruction(session, session.scalars(select(Map.id)).one())
-        assert isinstance(found, Reconstruction), found
-        return found
+            return get_reconstruction(session, session.scalars(select(Map.id)).one())
 
     def component(self, made: Reconstruction, number: int = 0) -> Component:
         return Component.decode(self.service.store.get(component_key(made.id, number)))

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shared.errors import Unprocessable
 from shared.geodesy import distance_m
 from shared.geometry.frames import (
     Alignment,
@@ -82,7 +83,7 @@ class Walk:
         self.altitudes = np.array([e.altitude_m for e in there])
         self.sigmas = np.full(count, 5.0)
 
-    def align(self) -> Alignment | str:
+    def align(self) -> Alignment:
         return align(
             self.centres,
             self.rotations,
@@ -91,11 +92,6 @@ class Walk:
             self.altitudes,
             self.sigmas,
         )
-
-    def aligned(self) -> Alignment:
-        found = self.align()
-        assert isinstance(found, Alignment), found
-        return found
 
     def errors(self, found: Alignment) -> np.ndarray:
         """(n, 3) metres in the plane of the walk."""
@@ -112,7 +108,7 @@ class Walk:
 @pytest.mark.parametrize("place", PLACES.values(), ids=PLACES)
 def test_component_is_aligned_with_noisy_coordinates(place: tuple[float, float]) -> None:
     walk = Walk(place)
-    found = walk.aligned()
+    found = walk.align()
     assert found.similarity.scale == pytest.approx(walk.scale, rel=0.03)
     assert np.abs(walk.errors(found)).max() < 2
     assert found.is_inlier.sum() > 50
@@ -122,7 +118,7 @@ def test_component_is_aligned_with_noisy_coordinates(place: tuple[float, float])
 def test_wrong_coordinates_do_not_move_the_others() -> None:
     walk = Walk(PLACES["Turin"], noise_m=0.1)
     walk.latitudes[::4] += 0.002  # 220 m
-    found = walk.aligned()
+    found = walk.align()
     assert np.abs(walk.errors(found)).max() < 0.5
     assert not found.is_inlier[::4].any()
     assert found.residuals_m[4] == pytest.approx(222, rel=0.01)
@@ -131,7 +127,7 @@ def test_wrong_coordinates_do_not_move_the_others() -> None:
 def test_photos_without_altitude_are_aligned_on_flat_ground() -> None:
     walk = Walk(PLACES["Turin"])
     walk.altitudes[:] = np.nan
-    found = walk.aligned()
+    found = walk.align()
     assert not found.similarity.knows_altitude
     assert np.abs(walk.errors(found)[:, :2]).max() < 2
 
@@ -139,7 +135,7 @@ def test_photos_without_altitude_are_aligned_on_flat_ground() -> None:
 def test_photos_without_coordinates_do_not_count() -> None:
     walk = Walk(PLACES["Turin"], noise_m=0.1)
     walk.latitudes[10:30] = walk.longitudes[10:30] = np.nan
-    found = walk.aligned()
+    found = walk.align()
     assert np.isnan(found.residuals_m[10:30]).all()
     assert not found.is_inlier[10:30].any()
     assert np.abs(walk.errors(found)).max() < 0.5
@@ -153,7 +149,7 @@ def test_street_on_a_line_is_turned_about_it_as_upright_cameras_are() -> None:
     walk.latitudes = np.array([place.latitude for place in places])
     walk.longitudes = np.array([place.longitude for place in places])
     walk.altitudes = np.array([place.altitude_m for place in places])
-    found = walk.aligned()
+    found = walk.align()
     assert found.is_on_line
     aside = walk.centres[30] + 20 / walk.scale * TURN[2]  # 20 m above the street
     height = found.similarity.apply(aside)[2] - found.similarity.apply(walk.centres[30])[2]
@@ -165,9 +161,8 @@ def test_bent_model_is_not_aligned() -> None:
     bend = np.zeros((60, 3))
     bend[42:] = (60, 30, 0)
     walk.centres = walk.centres + bend @ TURN / walk.scale
-    found = walk.align()
-    assert isinstance(found, str)
-    assert "agree with their coordinates: the reconstruction is bent" in found
+    with pytest.raises(Unprocessable, match="agree with their coordinates: the reconstruction is"):
+        walk.align()
 
 
 @pytest.mark.parametrize("bias", [False, True], ids=["independent errors", "errors of minutes"])
@@ -179,7 +174,7 @@ def test_covariance_contains_the_error_of_the_alignment(bias: bool) -> None:
             rng = np.random.default_rng(seed)
             walk.latitudes += 4e-5 * np.repeat(rng.normal(size=12), 5)  # 4.4 m
             walk.longitudes += 6e-5 * np.repeat(rng.normal(size=12), 5)
-        found = walk.aligned()
+        found = walk.align()
         error = walk.errors(found)[30]
         covariance = found.similarity.position_covariance(walk.centres[30])
         squares.append(error[:2] @ np.linalg.solve(covariance[:2, :2], error[:2]))
@@ -191,9 +186,9 @@ def test_covariance_contains_the_error_of_the_alignment(bias: bool) -> None:
     ("change", "reason"),
     [
         ("two", "2 of its photos have coordinates, and 3 are needed"),
-        ("same", "its photos are too close to each other for the errors of their coordinates"),
+        ("same", "Its photos are too close to each other for the errors of their coordinates"),
         ("wrong", "from their coordinates: these or the reconstruction are wrong"),
-        ("close", "its photos are too close to each other for the errors of their coordinates"),
+        ("close", "Its photos are too close to each other for the errors of their coordinates"),
     ],
 )
 def test_component_that_is_not_aligned_has_a_reason(change: str, reason: str) -> None:
@@ -208,13 +203,12 @@ def test_component_that_is_not_aligned_has_a_reason(change: str, reason: str) ->
     if change == "wrong":
         order = np.random.default_rng(0).permutation(40)
         walk.latitudes[:40], walk.longitudes[:40] = walk.latitudes[order], walk.longitudes[order]
-    found = walk.align()
-    assert isinstance(found, str)
-    assert reason in found
+    with pytest.raises(Unprocessable, match=reason):
+        walk.align()
 
 
 def test_similarity_is_read_as_it_was_stored() -> None:
-    stored = Walk(PLACES["Turin"]).aligned().similarity
+    stored = Walk(PLACES["Turin"]).align().similarity
     read = Similarity.from_json(stored.as_json())
     points = np.arange(6.0).reshape(2, 3)
     np.testing.assert_array_equal(read.apply(points), stored.apply(points))

@@ -8,9 +8,10 @@ from uuid import UUID
 import numpy as np
 import pytest
 
+from shared.errors import Unprocessable
 from shared.geometry.cameras import Camera, CameraSource
 from shared.geometry.component import Component
-from shared.geometry.localise import LocalPose, NoPose, localise
+from shared.geometry.localise import localise
 from shared.matching.features import FULL_SIDE, LocalFeatures
 from shared.matching.matchers import MutualNearest
 from tests.support.reconstructed_scene import CAMERA, ReconstructedScene, looking
@@ -29,11 +30,6 @@ def scene() -> ReconstructedScene:
     return ReconstructedScene()
 
 
-def found(outcome: LocalPose | NoPose) -> LocalPose:
-    assert isinstance(outcome, LocalPose), outcome
-    return outcome
-
-
 @pytest.mark.parametrize("focal", [350.0, 500.0, 800.0])
 @pytest.mark.parametrize("is_known", [True, False], ids=["focal length given", "estimated"])
 def test_photo_is_localised_with_a_third_of_wrong_matches(
@@ -42,15 +38,13 @@ def test_photo_is_localised_with_a_third_of_wrong_matches(
     camera = replace(CAMERA, focal_pixels=focal)
     query, _ = scene.take(ROTATION, CENTRE, camera, wrong=0.3)
     source = CameraSource.GIVEN if is_known else CameraSource.ESTIMATED
-    pose = found(
-        localise(
-            query,
-            scene.candidates,
-            [scene.component],
-            camera if is_known else None,
-            source,
-            MATCHER,
-        )
+    pose = localise(
+        query,
+        scene.candidates,
+        [scene.component],
+        camera if is_known else None,
+        source,
+        MATCHER,
     )
     assert pose.camera_source == source
     assert pose.component == 0
@@ -67,9 +61,8 @@ def test_photo_is_localised_with_a_third_of_wrong_matches(
 def test_photo_of_another_size_is_localised(scene: ReconstructedScene) -> None:
     camera = Camera(1920, 1080, 1300.0, radial=-0.05)
     query, _ = scene.take(ROTATION, CENTRE, camera)
-    pose = found(
-        localise(query, scene.candidates, [scene.component], None, CameraSource.ESTIMATED, MATCHER)
-    )
+    asked = query, scene.candidates, [scene.component], None, CameraSource.ESTIMATED
+    pose = localise(*asked, MATCHER)
     assert np.linalg.norm(pose.position - CENTRE) < 0.5
 
 
@@ -81,7 +74,7 @@ def test_principal_point_and_distortion_of_a_query_are_estimated_with_its_pose(
     shifted = replace(query, positions=np.clip(np.add(query.positions, (shift, 0)), 0, FULL_SIDE))
     camera = Camera.of_focal_length(query.width, query.height, CAMERA.focal_length)
     source = CameraSource.GIVEN
-    pose = found(localise(shifted, scene.candidates, [scene.component], camera, source, MATCHER))
+    pose = localise(shifted, scene.candidates, [scene.component], camera, source, MATCHER)
     assert angle_degrees(pose.rotation, ROTATION) < 0.2
     assert pose.camera.radial == pytest.approx(-0.04, abs=0.02)
 
@@ -90,10 +83,8 @@ def test_covariance_is_that_of_the_errors_of_many_queries(scene: ReconstructedSc
     squares = []
     for _ in range(60):
         query, _ = scene.take(ROTATION, CENTRE, wrong=0.3)
-        pose = found(
-            localise(
-                query, scene.candidates, [scene.component], CAMERA, CameraSource.GIVEN, MATCHER
-            )
+        pose = localise(
+            query, scene.candidates, [scene.component], CAMERA, CameraSource.GIVEN, MATCHER
         )
         turn = pose.rotation.T @ ROTATION
         error = np.concatenate([CENTRE - pose.position, [turn[1, 2], turn[2, 0], turn[0, 1]]])
@@ -105,39 +96,28 @@ def test_covariance_is_that_of_the_errors_of_many_queries(scene: ReconstructedSc
 def test_photos_that_are_left_out_are_not_used(scene: ReconstructedScene) -> None:
     photo, features = scene.candidates[2]
     everything = frozenset(scene.features)
-    outcome = localise(
+    asked = features, scene.candidates, [scene.component], CAMERA, CameraSource.GIVEN, MATCHER
+    with pytest.raises(Unprocessable):  # its own points, which no two others see
+        localise(*asked, everything - {photo})
+    pose = localise(
         features,
         scene.candidates,
         [scene.component],
         CAMERA,
         CameraSource.GIVEN,
         MATCHER,
-        everything - {photo},
-    )
-    assert isinstance(outcome, NoPose)  # its own points, which no two others see
-    pose = found(
-        localise(
-            features,
-            scene.candidates,
-            [scene.component],
-            CAMERA,
-            CameraSource.GIVEN,
-            MATCHER,
-            frozenset({photo}),
-        )
+        frozenset({photo}),
     )
     assert np.linalg.norm(pose.position - scene.component.centres()[2]) < 0.2
 
 
 def test_photo_of_another_scene_has_no_pose(scene: ReconstructedScene) -> None:
     query, _ = ReconstructedScene(seed=1).take(ROTATION, CENTRE)
-    outcome = localise(
-        query, scene.candidates, [scene.component], None, CameraSource.ESTIMATED, MATCHER
-    )
-    assert isinstance(outcome, NoPose)
-    assert outcome.reason.endswith(".")
-    outcome = localise(query, [], [scene.component], None, CameraSource.ESTIMATED, MATCHER)
-    assert outcome == NoPose("None of the best photos of the map is in the model.")
+    rest = [scene.component], None, CameraSource.ESTIMATED, MATCHER
+    with pytest.raises(Unprocessable, match=r"\.$"):
+        localise(query, scene.candidates, *rest)
+    with pytest.raises(Unprocessable, match="None of the best photos of the map is in the model"):
+        localise(query, [], *rest)
 
 
 def keep(features: LocalFeatures, chosen: np.ndarray) -> LocalFeatures:
@@ -156,9 +136,9 @@ def reason(
 ) -> str:
     source = CameraSource.GIVEN if camera else CameraSource.ESTIMATED
     components = [component or scene.component]
-    outcome = localise(query, scene.candidates, components, camera, source, MATCHER)
-    assert isinstance(outcome, NoPose), outcome
-    return outcome.reason
+    with pytest.raises(Unprocessable) as raised:
+        localise(query, scene.candidates, components, camera, source, MATCHER)
+    return raised.value.detail
 
 
 def test_few_points_in_a_corner_or_many_wrong_matches_are_no_pose(
@@ -180,7 +160,7 @@ def test_panorama_is_no_pose_unless_its_camera_is_given(scene: ReconstructedScen
     wide = Camera(1280, 640, 700.0)
     query, _ = scene.take(ROTATION, CENTRE, wide)
     assert "panorama" in reason(query, scene)
-    found(localise(query, scene.candidates, [scene.component], wide, CameraSource.GIVEN, MATCHER))
+    localise(query, scene.candidates, [scene.component], wide, CameraSource.GIVEN, MATCHER)
 
 
 def test_place_that_exists_twice_is_no_pose(scene: ReconstructedScene) -> None:
@@ -204,10 +184,10 @@ def test_place_that_exists_twice_is_no_pose(scene: ReconstructedScene) -> None:
         observations=np.tile(once.observations, 2),
     )
     candidates = [*scene.candidates, *((names[p], f) for p, f in scene.candidates)]
-    outcome = localise(query, candidates, [twice], CAMERA, CameraSource.GIVEN, MATCHER)
-    assert outcome == NoPose("Two places of the model explain the photo about equally well.")
+    with pytest.raises(Unprocessable, match="Two places of the model explain the photo"):
+        localise(query, candidates, [twice], CAMERA, CameraSource.GIVEN, MATCHER)
     # The photos of one of the two alone know no other place.
-    found(localise(query, scene.candidates, [twice], CAMERA, CameraSource.GIVEN, MATCHER))
+    localise(query, scene.candidates, [twice], CAMERA, CameraSource.GIVEN, MATCHER)
 
 
 def test_wrong_focal_length_is_a_reason(scene: ReconstructedScene) -> None:
@@ -241,4 +221,5 @@ def test_features_of_another_detection_are_ignored(scene: ReconstructedScene) ->
     query, _ = scene.take(ROTATION, CENTRE)
     fewer = [(p, keep(f, np.arange(len(f.positions) - 1))) for p, f in scene.candidates]
     source = CameraSource.GIVEN
-    assert isinstance(localise(query, fewer, [scene.component], CAMERA, source, MATCHER), NoPose)
+    with pytest.raises(Unprocessable):
+        localise(query, fewer, [scene.component], CAMERA, source, MATCHER)

@@ -22,7 +22,7 @@ from shared.geometry.cameras import Camera, CameraSource, Rays
 from shared.geometry.colmap_model import CAMERA_MODELS
 from shared.geometry.component import NO_POINT, Component
 from shared.geometry.frames import umeyama
-from shared.geometry.localise import LocalPose, localise
+from shared.geometry.localise import localise
 from shared.matching.matchers import MutualNearest
 from tests.support.reconstructed_scene import ReconstructedScene
 
@@ -126,7 +126,6 @@ def test_photo_is_localised_in_a_reconstruction(
         MATCHER,
         frozenset({photo}),
     )
-    assert isinstance(pose, LocalPose)
     row = mapped.component.photo_ids.index(photo)
     centres = mapped.component.centres()
     unit = np.linalg.norm(centres[0] - centres[-1]) / 8  # of the scene
