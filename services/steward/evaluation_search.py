@@ -52,9 +52,8 @@ class GeotaggedPhoto:
     """its path in its folder, else its file name"""
     place_is_estimated: bool = False
     """whether its place is an accepted proposal"""
-    denied_radius_m: float | None = None
-    denied: bool = False
-    """whether it was not taken at `spot`, as a person said of an answer"""
+    denied: CandidateLevel | None = None
+    """where it was not taken, as a person said; its place is not known then"""
     _name_parts: list[str] = field(init=False, compare=False)
     """text and digits of the name in turn"""
 
@@ -63,9 +62,9 @@ class GeotaggedPhoto:
 
     def is_right(self, level: CandidateLevel) -> bool | None:
         """Return whether the photo was taken in a level; None if that is not known."""
-        if self.denied:
-            return False if level.is_denied(self.spot, self.denied_radius_m) else None
-        return level.is_right(self.spot)
+        if self.denied is None:
+            return level.is_right(self.spot)
+        return False if level.is_within(self.denied) else None
 
     def is_same_sequence(self, other: GeotaggedPhoto) -> bool:
         """Return whether two photos are frames of one walk, drive or video.
@@ -127,11 +126,9 @@ def read_geotagged_photos(
 ) -> list[GeotaggedPhoto]:
     """Return the live geotagged photos of a role with a descriptor in the generation, by id.
 
-    None: photos without a place of which a person has denied one, at the denied place.
+    None: photos without a place of which a person has denied one.
     """
-    chosen = (Photo.role == role, is_geotagged())
-    if role is None:
-        chosen = (has_given_place(), ~is_geotagged())
+    of_role = (Photo.role == role, is_geotagged())
     photos = session.execute(
         select(
             Photo.id,
@@ -147,31 +144,22 @@ def read_geotagged_photos(
             Photo.map_id == map_id,
             Descriptor.generation_id == generation_id,
             Photo.deleted_at.is_(None),
-            *chosen,
+            *(of_role if role else (has_given_place(), ~is_geotagged())),
         )
         .order_by(Photo.id)
     )
-    found = []
-    for row in photos:
-        given = row[6] or {}
-        denied = None if role else given.get("denied")
-        if role is None and denied is None:  # its place was taken away since
-            continue
-        spot = PhotoLocation(*row[1:4])
-        if denied:
-            spot = PhotoLocation(denied["latitude"], denied["longitude"], denied["place"])
-        found.append(
-            GeotaggedPhoto(
-                row[0],
-                spot,
-                row[4],
-                row[5],
-                place_is_estimated=given.get("probability") is not None,
-                denied=denied is not None,
-                denied_radius_m=denied and denied["radius_m"],
-            )
+    return [
+        GeotaggedPhoto(
+            row[0],
+            PhotoLocation(*row[1:4]),
+            row[4],
+            row[5],
+            place_is_estimated=bool(row[6]) and row[6]["probability"] is not None,
+            denied=None if role else CandidateLevel(**row[6]["denied"]),
         )
-    return found
+        for row in photos
+        if role or "denied" in row[6]  # or else its given place was taken away since
+    ]
 
 
 MAX_READ_ATTEMPTS = 2

@@ -424,9 +424,7 @@ class MapEvaluation:
             self.on_query()
             if ranking is None:
                 continue
-            in_map = not query.denied and bool(
-                self.database.find_at_place(query.spot, self.radius_m)
-            )
+            in_map = bool(self.database.find_at_place(query.spot, self.radius_m))
             if in_map:
                 labelled.recall.add(
                     [is_same_place(query.spot, spot, self.radius_m) for _, spot in ranking]

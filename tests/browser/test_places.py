@@ -56,7 +56,7 @@ def test_proposals_are_given_at_once_and_taken_back(
 ) -> None:
     page = open_places(visitor)
     expect(page.locator(".lead")).to_contain_text("2 photos have no place")
-    expect(page.locator(".proposal").first).to_contain_text("looks like")
+    expect(page.locator(".proposal").first).to_contain_text("Looks like")
     assert [position(city, each) for each in unplaced] == [(None, None)] * 2
     page.get_by_label("Accept from (%)").fill("1")
     page.get_by_role("button", name="Give 2 places").click()
@@ -117,7 +117,7 @@ def test_a_wrong_answer_is_kept_without_a_place_and_taken_back(
 ) -> None:
     def deny(page: Page) -> None:
         page.get_by_role("button", name="This is wrong").click()
-        page.get_by_role("button", name="I don’t know, but not there").click()
+        page.get_by_role("button", name="know").click()
 
     page = visitor.visit(f"ask/{unplaced[0]}")
     deny(page)

@@ -97,16 +97,16 @@ class CandidateLevel:
         ends_above = self.is_path and bool(levels) and is_within_level(self.place, levels[0])
         return None if ends_above or not levels else False
 
-    def is_denied(self, denied: PhotoLocation, radius_m: float | None) -> bool:
-        """Return whether a photo that was not taken at the denied place is not in the level.
+    def is_within(self, other: CandidateLevel) -> bool:
+        """Return whether the level is another one, or a finer one of its path.
 
-        So it is if the level is the denied one, a finer one of its path, or a circle that contains
-        its position and is no larger.
+        Circles are compared by the position of the other one, and by their sizes.
         """
-        if self.radius_m is not None:
-            return radius_m is not None and self.radius_m <= radius_m and self.contains(denied)
-        of_level = PhotoLocation(None, None, self.place)
-        return denied.place is not None and replace(self, place=denied.place).contains(of_level)
+        if self.radius_m is None:
+            place = PhotoLocation(None, None, self.place)
+            return replace(other, is_path=self.is_path).contains(place)
+        center = PhotoLocation(other.latitude, other.longitude, None)
+        return self.radius_m <= (other.radius_m or 0.0) and self.contains(center)
 
 
 def candidate_levels(

@@ -54,7 +54,7 @@ async function choosePlace(estimate, similar, signal) {
     field("Place", place, "A label, such as a room, in a map of labels"),
     h("div", { class: "row end" },
       h("button", { type: "button", onclick: () => dialog.close() }, "Cancel"),
-      estimate.has_place && h("button", { type: "button", onclick: () => dialog.close("denied") }, "I don’t know, but not there"),
+      estimate.has_place && h("button", { type: "button", onclick: () => dialog.close("denied") }, "I don’t know"),
       h("button", { class: "primary", value: "yes" }, "Save")));
   // Both coordinates or a label.
   const check = () => {

@@ -149,7 +149,7 @@ export async function showPlaces(view, { signal }) {
       h("p", { class: "match-words" }, h("span", { class: "rank-word" }, String(number)), h("span", { class: "figure" }, percent(surety(proposal))),
         h("span", { class: "soft" }, latitude === null ? place : `within ${metres(radius)}`)),
       h("p", { class: "soft small" }, `Before: no place. After: ${latitude === null ? place : whereabouts({ ...proposal, place: null })}`),
-      h("p", { class: "small" }, reason),
+      h("p", { class: "small" }, reason.charAt(0).toUpperCase() + reason.slice(1)),
       h("div", { class: "row" },
         button("Give this place", () => give([proposal])),
         button("Not this", () => forget([proposal]), "link")));
