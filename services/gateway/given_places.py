@@ -13,7 +13,7 @@ from typing import Annotated, Any, Self
 from uuid import UUID
 
 from pydantic import Field, model_validator
-from sqlalchemy import func, or_, select, true
+from sqlalchemy import Row, func, or_, select, true
 from sqlalchemy.orm import Session
 
 from services.gateway.dependencies import NO_NUL_PATTERN, GatewayContext
@@ -124,7 +124,7 @@ def read_dated_photos(
     rows = session.execute(
         select(
             Photo.id,
-            func.coalesce(Photo.relative_path, Photo.filename),
+            func.coalesce(Photo.relative_path, Photo.filename).label("name"),
             Photo.captured_at,
             Photo.capture,
             Photo.latitude,
@@ -141,29 +141,21 @@ def read_dated_photos(
         )
         .limit(MAX_NEIGHBOURS)
     ).all()
-    dated = add_time_zones([_dated_photo(*row[1:]) for row in rows])
-    return {row[0]: photo for row, photo in zip(rows, dated, strict=True)}
+    dated = add_time_zones([_dated_photo(row) for row in rows])
+    return {row.id: photo for row, photo in zip(rows, dated, strict=True)}
 
 
-def _dated_photo(
-    name: str,
-    captured_at: datetime | None,
-    capture: dict[str, Any] | None,
-    latitude: float | None,
-    longitude: float | None,
-    given_place: dict[str, Any] | None,
-) -> DatedPhoto:
-    capture = capture or {}
-    if given_place and given_place["probability"] is not None:
-        latitude = longitude = None
+def _dated_photo(row: Row[Any]) -> DatedPhoto:
+    capture = row.capture or {}
+    is_estimated = row.given_place and row.given_place["probability"] is not None
     offset = capture.get("clock_offset_seconds")
     return DatedPhoto(
-        name,
-        captured_at,
+        row.name,
+        row.captured_at,
         capture.get("time_zone_is_known", False),
         capture.get("camera"),
-        latitude,
-        longitude,
+        None if is_estimated else row.latitude,
+        None if is_estimated else row.longitude,
         None if offset is None else timedelta(seconds=offset),
         capture.get("camera_is_unique", False),
     )

@@ -137,15 +137,6 @@ class _LabelledQueryMetrics:
     denied: list[QueryOutcome] = field(default_factory=list)
     """of photos of which only the denied place is known"""
 
-    def to_fit(self) -> list[QueryOutcome]:
-        """Return the outcomes that the place model is fitted on.
-
-        Denied answers are all wrong: they count beside enough queries that were not chosen so.
-        """
-        known = [o for o in self.outcomes if not o.same_session]
-        denied = [o for o in self.denied if not o.same_session]
-        return [*known, *denied] if len(known) >= MIN_LABELLED_QUERIES else known
-
     def figures(self, model: PlaceModel) -> dict[str, Any]:
         """Return the metrics as JSON; queries are accepted by the model's `in_map`.
 
@@ -283,7 +274,9 @@ class MapEvaluation:
         spread = own_photos.spread(indices)
         labelled = self._evaluate_labelled_queries(own_photos, spread)
         samples = list(own_photos.samples(indices, spread))
-        to_fit = labelled.to_fit()
+        to_fit = [o for o in labelled.outcomes if not o.same_session]
+        if len(to_fit) >= MIN_LABELLED_QUERIES:  # denied answers alone are all wrong
+            to_fit += [o for o in labelled.denied if not o.same_session]
         scores = MapScores(
             spread,
             self._measure_background(sample),

@@ -143,13 +143,6 @@ def test_tracks_without_times_are_refused(tmp_path: Path) -> None:
         assert refusal.value.code == "bad_gpx"
 
 
-def test_a_sidecar_with_coordinates_counts_as_coordinates_of_the_photo(folder: Path) -> None:
-    (folder / "4.jpg.xmp").write_bytes(add_position(None, LATITUDE, LONGITUDE, 5.0))
-    photos = {each.name: each for each in read_folder(folder, None, 0.0)}
-    assert photos["4.jpg"].latitude == pytest.approx(LATITUDE, abs=1e-6)
-    assert proposals(folder).keys() == {"day 1/2.jpg"}
-
-
 def test_a_photo_whose_gps_tag_is_not_understood_is_named_and_never_written(folder: Path) -> None:
     unread = folder / "day 1" / "2.jpg"
     with pyexiv2.Image(str(unread)) as image:
