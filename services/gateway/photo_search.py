@@ -148,6 +148,8 @@ def search_photos(
         rare = select(Photo.id).where(*conditions).cte("rare")
         page = select(Photo).join(rare.prefix_with("MATERIALIZED"), rare.c.id == Photo.id)
         page = page.where(*live).order_by(*newest)
+    elif not on_postgres:
+        page = select(Photo).where(*live, *conditions).order_by(*newest)
     else:
         # OFFSET 0 keeps the conditions out of the subquery: inside, the planner may look them up in
         # their indexes and sort hundreds of thousands of rows.

@@ -45,7 +45,8 @@ class Photo(Journaled, Base):
     `descriptors`. `altitude` is in metres, above the sea where its source says so; `focal_length`
     is a multiple of the longer side. `changed_version` is the map's version at the last change that
     affects searches. `given_place` is the journal of a place that the photo was given here: the
-    `former` and the `written` values by column, `probability`, `reason` and `given_at`.
+    `former` and the `written` values by column, `probability`, `reason` and `given_at`; or of one
+    that was `denied`.
     """
 
     __tablename__ = "photos"

@@ -159,3 +159,12 @@ def test_a_removed_photo_is_restored_from_the_trash_or_deleted_for_good(
     page.get_by_role("button", name="Delete for good", exact=True).click()
     expect(card).to_have_count(0)
     assert city.get("/search", removed=True, filename="gone")["total_found"] == 0
+
+    for photo_id in bring_in(city, "gone.jpg", "gone-too.jpg"):
+        city.server.client.delete(f"/api/v1/uploads/{photo_id}", params={"map": MAP})
+    visitor.visit("trash")
+    page.get_by_role("button", name="Empty the trash…").click()
+    expect(page.get_by_role("dialog")).to_contain_text("photos and their bytes are deleted")
+    page.get_by_role("button", name="Delete for good", exact=True).click()
+    expect(page.locator(".total")).to_have_text("The trash is empty.")
+    assert city.get("/search", removed=True)["total_found"] == 0

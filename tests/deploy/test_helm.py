@@ -226,6 +226,29 @@ def test_no_manifest_holds_a_secret_and_each_pod_gets_only_its_own(name: str) ->
     assert not set(settings) & set(SECRET_SETTINGS)
 
 
+def test_a_steward_with_an_immich_library_has_what_that_of_the_compose_file_has() -> None:
+    compose = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]["steward"]
+    names = {n for n in compose["environment"] if n.startswith(("IMMICH_", "PLACEWISE_"))}
+    given = variables(by_component("production", "Deployment")["steward"])
+    assert len(names) == 5
+    assert names <= set(given)
+    assert not names & set(variables(by_component("cpu", "Deployment")["steward"]))
+    keys = [
+        given[name]["valueFrom"]["secretKeyRef"] for name in ("IMMICH_API_KEY", "PLACEWISE_KEY")
+    ]
+    assert [key["key"] for key in keys] == ["IMMICH_API_KEY", "ADMIN_KEY"]
+    gateway = by_component("production", "Service")["gateway"]
+    assert gateway["spec"]["ports"][0]["port"] == 80
+    assert given["PLACEWISE_SERVER"]["value"] == f"http://{gateway['metadata']['name']}"
+    (policy,) = (
+        one["spec"]
+        for one in of_kind("production", "NetworkPolicy")
+        if one["metadata"]["name"] == f"{RELEASE}-search-clients"
+    )
+    selector = policy["egress"][-1]["to"][0]["podSelector"]["matchLabels"]
+    assert selector == gateway["spec"]["selector"]
+
+
 def test_an_external_store_fills_the_secret_that_the_pods_read() -> None:
     (external,) = of_kind("production", "ExternalSecret")
     secret = external["spec"]["target"]["name"]

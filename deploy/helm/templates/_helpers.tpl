@@ -73,7 +73,7 @@ topologySpreadConstraints:
   {{- end }}
 {{- end }}
 
-{{/* What every container has in common: settings, its secrets, a read-only file system. Takes root, image, args, secrets, values, and env and mounts in addition. */}}
+{{/* What every container has in common: settings, its secrets, a read-only file system. Takes root, image, args, secrets, values, and in addition env, mounts and keys: variables of commands, which read no files, by the Secret's entries. */}}
 {{- define "placewise.container" -}}
 - name: placewise
   image: {{ .root.Values.image.prefix }}placewise-{{ .image }}:{{ .root.Values.image.tag | default .root.Chart.AppVersion }}{{ .imageSuffix }}
@@ -92,6 +92,10 @@ topologySpreadConstraints:
     - name: {{ . }}
       valueFrom: {secretKeyRef: {name: {{ $.root.Values.secrets.existingSecret }}, key: {{ . }}}}
     {{- end }}
+    {{- end }}
+    {{- range $name, $key := .keys }}
+    - name: {{ $name }}
+      valueFrom: {secretKeyRef: {name: {{ $.root.Values.secrets.existingSecret }}, key: {{ $key }}}}
     {{- end }}
   securityContext:
     allowPrivilegeEscalation: false

@@ -119,13 +119,11 @@ def _missing_descriptors(session: Session, manifest: ChunkManifest) -> dict[UUID
     map_id = session.get_one(Generation, manifest.generation_id).map_id
     for begin in range(0, len(photo_ids), ROWS_PER_STATEMENT):
         batch = photo_ids[begin : begin + ROWS_PER_STATEMENT]
-        live = select(Photo.id).where(
-            Photo.id.in_(batch), Photo.map_id == map_id, Photo.deleted_at.is_(None)
-        )
+        present = select(Photo.id).where(Photo.id.in_(batch), Photo.map_id == map_id)
         described = select(Descriptor.photo_id).where(
             Descriptor.photo_id.in_(batch), Descriptor.generation_id == manifest.generation_id
         )
-        missing |= {*session.scalars(live)} - {*session.scalars(described)}
+        missing |= {*session.scalars(present)} - {*session.scalars(described)}
     return {photo_id: row for photo_id, row in rows.items() if photo_id in missing}
 
 

@@ -134,7 +134,7 @@ def _queue_photos(catalog: Catalog, progress: Progress) -> int:
     has_job = exists().where(Job.id == Photo.job_id)
     missing = (
         select(Photo.id, Photo.map_id, Photo.job_id)
-        .where(~has_job, ~described)
+        .where(~has_job, ~described, Photo.deleted_at.is_(None))
         .order_by(Photo.id)
         .limit(ROWS_PER_STATEMENT)
     )

@@ -17,7 +17,7 @@ export function proposalCard(number, { photo, like = null, sure = false, certain
     h("div", { class: "two-photos" }, figureOf(photo, nameOf(photo)), like && figureOf(like, `Looks like ${nameOf(like)}`)),
     h("p", { class: "match-words" }, h("span", { class: "rank-word" }, String(number)), h("span", { class: "figure" }, figure), h("span", { class: "soft" }, words)),
     h("p", { class: "soft small" }, `Before: ${before}. After: ${after}`),
-    reason && h("p", { class: "small" }, reason),
+    reason && h("p", { class: "small" }, reason.charAt(0).toUpperCase() + reason.slice(1)),
     h("div", { class: "row" }, actions));
 }
 

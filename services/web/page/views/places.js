@@ -31,7 +31,7 @@ export async function givePlace(place, ondone = async () => {}) {
   const { skipped } = await post("/places", { json: { photos: [place] } });
   const [reason] = Object.values(skipped);
   if (reason) throw new Error(`Not changed: the photo ${reason}.`);
-  note("The photo has this place now.", "", async () => {
+  note(place.denied ? "Kept: the photo was not taken there." : "The photo has this place now.", "", async () => {
     await undoPlaces([place.file_id]);
     await ondone();
   });
@@ -170,7 +170,7 @@ export async function showPlaces(view, { signal }) {
     const { images, total_found: found } = await get("/search", { query: { place_given: true, limit: GIVEN_SHOWN }, signal });
     given.hidden = found === 0;
     fill(given,
-      h("header", { class: "head" }, h("h2", {}, `${plural(found, "place")} given here`), button("Undo all", () => takeBack(null))),
+      h("header", { class: "head" }, h("h2", {}, `${plural(found, "place")} given or denied here`), button("Undo all", () => takeBack(null))),
       acceptedList(images.map((photo) => [photo, givenInWords(photo) ?? "got another place since"]), (photos) => takeBack(photos.map(({ image_id: id }) => id))),
       found > images.length && h("p", { class: "soft" }, `The newest ${count(images.length)} are shown.`));
   }
@@ -180,4 +180,4 @@ export async function showPlaces(view, { signal }) {
 }
 
 /** What a given place rests on; null for a place that was sent with the photo. */
-export const givenInWords = ({ given_place: given }) => given && (given.probability === null ? "A person chose this place." : `Proposed with ${percent(given.probability)}: ${given.reason}`);
+export const givenInWords = ({ given_place: given }) => given && (given.denied ? `A person said that it was not taken ${given.denied.place ? `in ${given.denied.place}` : "where an answer put it"}.` : given.probability === null ? "A person chose this place." : `Proposed with ${percent(given.probability)}: ${given.reason}`);
