@@ -13,7 +13,7 @@ from typing import Annotated, Any, Self
 from uuid import UUID
 
 from pydantic import Field, model_validator
-from sqlalchemy import func, or_, select, true
+from sqlalchemy import Row, func, or_, select, true
 from sqlalchemy.orm import Session
 
 from services.gateway.dependencies import NO_NUL_PATTERN, GatewayContext
@@ -51,7 +51,12 @@ from shared.responses.reconstructions import (
     StoredProposalResponse,
     UndonePlacesResponse,
 )
-from shared.responses.similarity import PhotoResponse, SimilarityResponse, SimilarPhotoResponse
+from shared.responses.similarity import (
+    DeniedPlace,
+    PhotoResponse,
+    SimilarityResponse,
+    SimilarPhotoResponse,
+)
 from shared.search_api.photo_filter import Box, PhotoFilter
 
 WITH_COORDINATES = PhotoFilter(box=Box(south=-90, west=-180, north=90, east=180))
@@ -63,7 +68,7 @@ Label = Annotated[str, Field(max_length=MAX_TEXT_CHARACTERS, pattern=NO_NUL_PATT
 
 
 class GivenPlaceBody(FiniteModel):
-    """A place for one photo."""
+    """A place for one photo, or one where it was not taken."""
 
     file_id: UUID
     latitude: Latitude | None = None
@@ -74,6 +79,10 @@ class GivenPlaceBody(FiniteModel):
         None, description="of the proposal; omit it for a place that a person chose"
     )
     reason: str = Field("", max_length=MAX_TEXT_CHARACTERS, pattern=NO_NUL_PATTERN)
+    denied: bool = Field(
+        False, description="the photo was not taken there: it gets no place, and evaluations know"
+    )
+    radius_m: float | None = Field(None, gt=0, description="of the circle that is denied")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -89,6 +98,8 @@ class GivenPlaceBody(FiniteModel):
     def columns(self, photo: Photo) -> dict[str, Any]:
         """Return the columns that the place sets."""
         columns: dict[str, Any] = {}
+        if self.denied:
+            return columns
         if self.latitude is not None:
             columns |= {"latitude": self.latitude, "longitude": self.longitude}
         if self.heading is not None and photo.heading is None:
@@ -113,7 +124,7 @@ def read_dated_photos(
     rows = session.execute(
         select(
             Photo.id,
-            func.coalesce(Photo.relative_path, Photo.filename),
+            func.coalesce(Photo.relative_path, Photo.filename).label("name"),
             Photo.captured_at,
             Photo.capture,
             Photo.latitude,
@@ -130,29 +141,21 @@ def read_dated_photos(
         )
         .limit(MAX_NEIGHBOURS)
     ).all()
-    dated = add_time_zones([_dated_photo(*row[1:]) for row in rows])
-    return {row[0]: photo for row, photo in zip(rows, dated, strict=True)}
+    dated = add_time_zones([_dated_photo(row) for row in rows])
+    return {row.id: photo for row, photo in zip(rows, dated, strict=True)}
 
 
-def _dated_photo(
-    name: str,
-    captured_at: datetime | None,
-    capture: dict[str, Any] | None,
-    latitude: float | None,
-    longitude: float | None,
-    given_place: dict[str, Any] | None,
-) -> DatedPhoto:
-    capture = capture or {}
-    if given_place and given_place["probability"] is not None:
-        latitude = longitude = None
+def _dated_photo(row: Row[Any]) -> DatedPhoto:
+    capture = row.capture or {}
+    is_estimated = row.given_place and row.given_place["probability"] is not None
     offset = capture.get("clock_offset_seconds")
     return DatedPhoto(
-        name,
-        captured_at,
+        row.name,
+        row.captured_at,
         capture.get("time_zone_is_known", False),
         capture.get("camera"),
-        latitude,
-        longitude,
+        None if is_estimated else row.latitude,
+        None if is_estimated else row.longitude,
         None if offset is None else timedelta(seconds=offset),
         capture.get("camera_is_unique", False),
     )
@@ -172,7 +175,9 @@ def search_for_place(gateway: GatewayContext, map_name: str, photo: Photo) -> Si
     )
 
 
-def _is_at(photo: SimilarPhotoResponse, proposal: Proposal | None, label: str | None) -> bool:
+def _is_at(
+    photo: SimilarPhotoResponse | DeniedPlace, proposal: Proposal | None, label: str | None
+) -> bool:
     """Return whether a photo has a place that a proposal, or else a label, speaks of."""
     if proposal is None:
         return label is not None and photo.place == label
@@ -219,6 +224,10 @@ def _propose_place(
         picture, similar = picture_evidence(answer, photo_count), answer.similar_images
         label, probability = probable_label(answer.estimate)
     proposal, reason = finder.propose(dated, picture)
+    denied = (photo.given_place or {}).get("denied")
+    if denied and _is_at(DeniedPlace(**denied), proposal, label):
+        proposal, label, probability = None, None, None
+        error = "A person said that it was not taken where it seems to be"
     if gps_error := (photo.capture or {}).get("gps_error"):
         proposal, label, probability = None, None, None
         error = f"It may have coordinates: {gps_error}"
@@ -256,6 +265,9 @@ def give_places(
                 "reason": place.reason,
                 "given_at": datetime.now(UTC).isoformat(),
             }
+            if place.denied:
+                named = {"latitude", "longitude", "radius_m", "place"}
+                photo.given_place["denied"] = place.model_dump(include=named)
             for name, value in written.items():
                 setattr(photo, name, value)
             photo.changed_version = version

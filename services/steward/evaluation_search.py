@@ -21,10 +21,10 @@ from sqlalchemy.orm import Session
 from shared.catalog.chunks import Descriptor, find_descriptor, find_feature_rows
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
-from shared.catalog.photos import Photo, PhotoRole, is_geotagged
-from shared.config.shards import is_shard_name
+from shared.catalog.photos import Photo, PhotoRole, has_given_place, is_geotagged
 from shared.errors import Conflict, Gone, Unavailable
 from shared.evaluation.places.evidence import PhotoLocation, match_support
+from shared.evaluation.places.levels import CandidateLevel
 from shared.geodesy import distances_m, latitude_bounds
 from shared.search_api.photo_filter import PhotoFilter
 from shared.search_api.protocol import (
@@ -51,11 +51,19 @@ class GeotaggedPhoto:
     """its path in its folder, else its file name"""
     place_is_estimated: bool = False
     """whether its place is an accepted proposal"""
+    denied: CandidateLevel | None = None
+    """where it was not taken, as a person said; its place is not known then"""
     _name_parts: list[str] = field(init=False, compare=False)
     """text and digits of the name in turn"""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_name_parts", re.split(r"([0-9]+)", self.name))
+
+    def is_right(self, level: CandidateLevel) -> bool | None:
+        """Return whether the photo was taken in a level; None if that is not known."""
+        if self.denied is None:
+            return level.is_right(self.spot)
+        return False if level.is_within(self.denied) else None
 
     def is_same_sequence(self, other: GeotaggedPhoto) -> bool:
         """Return whether two photos are frames of one walk, drive or video.
@@ -113,9 +121,13 @@ class GeotaggedPhotos:
 
 
 def read_geotagged_photos(
-    session: Session, map_id: UUID, generation_id: UUID, role: PhotoRole
+    session: Session, map_id: UUID, generation_id: UUID, role: PhotoRole | None
 ) -> list[GeotaggedPhoto]:
-    """Return the live geotagged photos of a role with a descriptor in the generation, by id."""
+    """Return the live geotagged photos of a role with a descriptor in the generation, by id.
+
+    None: photos without a place of which a person has denied one.
+    """
+    of_role = (Photo.role == role, is_geotagged())
     photos = session.execute(
         select(
             Photo.id,
@@ -131,8 +143,7 @@ def read_geotagged_photos(
             Photo.map_id == map_id,
             Descriptor.generation_id == generation_id,
             Photo.deleted_at.is_(None),
-            Photo.role == role,
-            is_geotagged(),
+            *(of_role if role else (has_given_place(), ~is_geotagged())),
         )
         .order_by(Photo.id)
     )
@@ -143,8 +154,10 @@ def read_geotagged_photos(
             row[4],
             row[5],
             place_is_estimated=bool(row[6]) and row[6]["probability"] is not None,
+            denied=None if role else CandidateLevel(**row[6]["denied"]),
         )
         for row in photos
+        if role or "denied" in row[6]  # or else its given place was taken away since
     ]
 
 
@@ -215,7 +228,7 @@ class EvaluationSearch:
 
         Raises:
             Conflict: `map_damaged`: a chunk can't be read.
-            Unavailable: `search_incomplete`: a shard did not answer.
+            Unavailable: `search_incomplete`: rows are still to be written to the engine.
         """
         for attempt in range(1, MAX_READ_ATTEMPTS + 1):
             with self.catalog.read() as session:
@@ -242,10 +255,10 @@ class EvaluationSearch:
                 if error.code == "chunk_unreadable":
                     raise map_damaged_error([chunk.object_key]) from error
                 raise
-            if any(is_shard_name(part) for part in answer.missing):
+            if answer.filling:
                 raise Unavailable(
                     "search_incomplete",
-                    f"Shards {', '.join(answer.missing)} did not answer: the results would cover "
+                    "Rows are still being written to the search engine: the results would cover "
                     "only a part of the map.",
                 )
             if answer.missing:

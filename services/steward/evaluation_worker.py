@@ -85,7 +85,8 @@ class EvaluationWorker:
         progress: JobProgress,
     ) -> None:
         sample = evaluation.draw_sample(job.params["sample"], job.params["seed"])
-        searched = len(sample) + len(evaluation.queries) + evaluation.matched_photos(sample)
+        queries = [*sample, *evaluation.queries, *evaluation.denied]
+        searched = len(queries) + evaluation.matched_photos(sample)
         progress.total = searched
         evaluated = evaluation.evaluate(sample)
         result = {"evaluation_id": str(new_id()), "generation_id": str(generation.id)}

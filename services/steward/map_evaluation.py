@@ -45,7 +45,12 @@ from shared.evaluation.places.evidence import (
 from shared.evaluation.places.figures import PlaceEvaluation, evaluate_places
 from shared.evaluation.places.fit import MIN_OWN_PHOTOS, MapScores, PlaceSample
 from shared.evaluation.places.levels import LevelScheme, candidate_levels
-from shared.evaluation.places.probability import Background, MapExtent, PlaceModel
+from shared.evaluation.places.probability import (
+    MIN_LABELLED_QUERIES,
+    Background,
+    MapExtent,
+    PlaceModel,
+)
 from shared.evaluation.places.samples import (
     SAME_SESSION_PERIOD,
     IndexRanking,
@@ -129,6 +134,8 @@ class _LabelledQueryMetrics:
 
     recall: RecallCounter = field(default_factory=RecallCounter)
     outcomes: list[QueryOutcome] = field(default_factory=list)
+    denied: list[QueryOutcome] = field(default_factory=list)
+    """of photos of which only the denied place is known"""
 
     def figures(self, model: PlaceModel) -> dict[str, Any]:
         """Return the metrics as JSON; queries are accepted by the model's `in_map`.
@@ -142,6 +149,7 @@ class _LabelledQueryMetrics:
         return {
             **self.recall.figures(),
             "out_of_map": len(outside),
+            "denied": len(self.denied),
             "same_session": sum(o.same_session for o in self.outcomes),
             "median_error_of_right_ones_m": median(errors) if errors else None,
             "accepted_in_map": ratio(sum(o.in_map for o in accepted), len(inside)),
@@ -226,6 +234,7 @@ class MapEvaluation:
             self.database = GeotaggedPhotos(_draw(database, max_photos or len(database), seed=0))
             queries = read_geotagged_photos(session, *ids, PhotoRole.QUERY)
             self.queries = _draw(queries, max_photos or len(queries), seed=0)
+            self.denied = read_geotagged_photos(session, *ids, None)
             version = session.get_one(Map, generation.map_id).version
             has_features = find_features_model(session, generation.id) is not None
             has_own_vocabulary = vocabulary_standing(session, generation) == "own"
@@ -262,6 +271,8 @@ class MapEvaluation:
         labelled = self._evaluate_labelled_queries(own_photos, spread)
         samples = list(own_photos.samples(indices, spread))
         to_fit = [o for o in labelled.outcomes if not o.same_session]
+        if len(to_fit) >= MIN_LABELLED_QUERIES:  # denied answers alone are all wrong
+            to_fit += [o for o in labelled.denied if not o.same_session]
         scores = MapScores(
             spread,
             self._measure_background(sample),
@@ -397,7 +408,7 @@ class MapEvaluation:
         self, own_photos: OwnPhotoSampler, spread: float
     ) -> _LabelledQueryMetrics:
         labelled = _LabelledQueryMetrics()
-        for number, query in enumerate(self.queries):
+        for number, query in enumerate([*self.queries, *self.denied]):
             ranking = self.search.rank_similar(query, EVIDENCE_DEPTH)
             self.on_query()
             if ranking is None:
@@ -414,12 +425,13 @@ class MapEvaluation:
             best = self._index_of.get(ranking[0][0].photo_id) if ranking else None
             neighbours = own_photos.neighbours(best) if best is not None else []
             levels = candidate_levels(ranked, neighbours, self.scheme, spread, self.radius_m)
-            right = [level.is_right(query.spot) for level in levels]
+            right = [query.is_right(level) for level in levels]
             matched = None
             if levels and self.matching != Matching.OFF and number < MAX_MATCHED_SAMPLE:
                 matched = self._match_query(query, number, ranked, neighbours, spread)
             estimate = estimate_location(ranked, self.radius_m) if levels else UNKNOWN_LOCATION
-            labelled.outcomes.append(
+            outcomes = labelled.denied if query.denied else labelled.outcomes
+            outcomes.append(
                 QueryOutcome(
                     in_map=in_map,
                     is_correct=is_same_place(query.spot, estimate, self.radius_m),
@@ -444,7 +456,7 @@ class MapEvaluation:
         if not are_matched(ranked):
             return None
         levels = candidate_levels(ranked, neighbours, self.scheme, spread, self.radius_m)
-        return PlaceSample(number, levels, [level.is_right(query.spot) for level in levels])
+        return PlaceSample(number, levels, [query.is_right(level) for level in levels])
 
     def _same_session(self, query: GeotaggedPhoto, best: SearchHit) -> bool:
         match = self._by_id.get(best.photo_id)

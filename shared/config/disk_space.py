@@ -51,7 +51,7 @@ class DiskReserve:
             self._file.unlink(missing_ok=True)
             log.warning(
                 "the disk of %s is full (%d bytes free): the catalog's reserve of %d bytes was "
-                "released. Delete photos or maps, or free disk space",
+                "released. Empty the trash of photos, delete maps, or free disk space",
                 self._folder,
                 free,
                 RESERVE_BYTES,
@@ -116,7 +116,7 @@ class DiskSpace:
                 "disk_full",
                 f"The server's disk has {free // 1_000_000} MB free, and this request needs "
                 f"{required // 1_000_000} MB (MIN_FREE_BYTES={self._min_free_bytes}). Free disk "
-                "space, or delete photos or maps.",
+                "space, empty the trash of photos, or delete maps.",
                 retry_after_seconds=DISK_RETRY_SECONDS,
                 free_bytes=free,
             )

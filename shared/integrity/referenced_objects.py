@@ -19,7 +19,7 @@ from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState
 from shared.catalog.maps import Map
 from shared.catalog.models import Model
-from shared.catalog.photos import Photo
+from shared.catalog.photos import Photo, is_kept
 from shared.catalog.reconstructions import Reconstruction
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.storage.chunks import features_key, manifest_key
@@ -63,12 +63,12 @@ class ReferencedObject:
 
 
 def list_referenced_objects(session: Session) -> Iterator[ReferencedObject]:
-    """Iterate over the objects of live photos, models, reconstructions, unfinished jobs and the
-    generations that are active or being built, of maps that are not deleted."""
+    """Iterate over the objects of photos (in the trash, too), models, reconstructions, unfinished
+    jobs and the generations that are active or being built, of maps that are not deleted."""
     photos = select(Photo.id, Photo.object_key, Photo.size_bytes, Photo.sha256).join(
         Map, Map.id == Photo.map_id
     )
-    photos = photos.where(Photo.deleted_at.is_(None), Map.deleted_at.is_(None))
+    photos = photos.where(is_kept(), Map.deleted_at.is_(None))
     for row in session.execute(photos.execution_options(yield_per=ROWS_PER_QUERY)):
         yield ReferencedObject(
             row.object_key, ObjectKind.ORIGINAL, row.id, row.size_bytes, row.sha256

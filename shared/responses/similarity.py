@@ -32,6 +32,15 @@ class SeenPoint(ResponseModel):
     """in the component's frame"""
 
 
+class DeniedPlace(ResponseModel):
+    """A place of an answer where a photo was not taken, as a person says."""
+
+    latitude: float | None
+    longitude: float | None
+    radius_m: float | None
+    place: str | None
+
+
 class GivenPlace(ResponseModel):
     """What a place rests on that was given to a photo with `POST /places`."""
 
@@ -40,6 +49,7 @@ class GivenPlace(ResponseModel):
     probability: float | None = Field(description="of the proposal; null if a person chose it")
     reason: str
     given_at: datetime
+    denied: DeniedPlace | None = Field(None, description="set if the photo was given no place")
 
 
 class PhotoResponse(ResponseModel):
@@ -298,6 +308,6 @@ class SimilarityResponse(ResponseModel):
         False, description="true: `missing` names parts of the map that could not be searched"
     )
     missing: list[str] = Field(
-        description="what could not be searched: unreadable chunks (`chunks/....npy`) and shards "
-        "without a search worker (`shard 1/3`)"
+        description="what could not be searched: chunks (`chunks/....npy`) that are unreadable, or "
+        "still to be written to the search engine"
     )

@@ -279,7 +279,7 @@ def _raise_storage_full() -> Iterator[None]:
 def _disk_full_error() -> StorageFull:
     return StorageFull(
         "disk_full",
-        "The disk of the object store is full. Free disk space, or delete photos or maps.",
+        "The disk of the object store is full. Free disk space, empty the trash, or delete maps.",
         retry_after_seconds=FULL_RETRY_SECONDS,
     )
 

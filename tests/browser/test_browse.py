@@ -23,15 +23,8 @@ def bring_in(city: CityServer, *names: str) -> list[str]:
     ids = []
     for name in names:
         number = sum(map(ord, name))
-        answer = city.server.client.post(
-            "/api/v1/upload",
-            params={"map": MAP},
-            files={"file": (name, photo_bytes(number))},
-            data={"role": "query", "latitude": "44.0", "longitude": "8.7", "tags": "first"},
-            headers={"Prefer": "wait=60"},
-        )
-        assert answer.status_code == 201, answer.text
-        ids.append(answer.json()["file_id"])
+        fields = {"role": "query", "latitude": 44, "longitude": 8.7, "tags": "first"}
+        ids.append(city.server.indexed(photo_bytes(number), name, MAP, **fields))
     return ids
 
 
@@ -166,3 +159,12 @@ def test_a_removed_photo_is_restored_from_the_trash_or_deleted_for_good(
     page.get_by_role("button", name="Delete for good", exact=True).click()
     expect(card).to_have_count(0)
     assert city.get("/search", removed=True, filename="gone")["total_found"] == 0
+
+    for photo_id in bring_in(city, "gone.jpg", "gone-too.jpg"):
+        city.server.client.delete(f"/api/v1/uploads/{photo_id}", params={"map": MAP})
+    visitor.visit("trash")
+    page.get_by_role("button", name="Empty the trash…").click()
+    expect(page.get_by_role("dialog")).to_contain_text("photos and their bytes are deleted")
+    page.get_by_role("button", name="Delete for good", exact=True).click()
+    expect(page.locator(".total")).to_have_text("The trash is empty.")
+    assert city.get("/search", removed=True)["total_found"] == 0

@@ -23,14 +23,7 @@ def unplaced(city: CityServer, tmp_path: Path) -> Iterator[list[str]]:
         path = tmp_path / f"unplaced-{number}.jpg"
         with Image.open(original) as image:
             image.point(lambda value: int(value * 0.9)).save(path)
-        answer = city.server.client.post(
-            "/api/v1/upload",
-            params={"map": MAP},
-            files={"file": (path.name, path.read_bytes())},
-            headers={"Prefer": "wait=60"},
-        )
-        assert answer.status_code == 201, answer.text
-        ids.append(answer.json()["file_id"])
+        ids.append(city.server.indexed(path.read_bytes(), path.name, MAP))
     yield ids
     for file_id in ids:
         params = {"map": MAP, "permanently": "true"}
@@ -56,7 +49,7 @@ def test_proposals_are_given_at_once_and_taken_back(
 ) -> None:
     page = open_places(visitor)
     expect(page.locator(".lead")).to_contain_text("2 photos have no place")
-    expect(page.locator(".proposal").first).to_contain_text("looks like")
+    expect(page.locator(".proposal").first).to_contain_text("Looks like")
     assert [position(city, each) for each in unplaced] == [(None, None)] * 2
     page.get_by_label("Accept from (%)").fill("1")
     page.get_by_role("button", name="Give 2 places").click()
@@ -110,6 +103,35 @@ def test_an_answer_to_a_stored_photo_is_put_there_and_taken_back(
     page.locator(".note").get_by_role("button", name="Undo").click()
     expect(page.get_by_text("1 place taken back.")).to_be_visible()
     assert position(city, unplaced[0]) == (None, None)
+
+
+def test_a_wrong_answer_is_kept_without_a_place_and_taken_back(
+    visitor: Visitor, city: CityServer, unplaced: list[str]
+) -> None:
+    def deny(page: Page) -> None:
+        page.get_by_role("button", name="This is wrong").click()
+        page.get_by_role("button", name="know").click()
+
+    page = visitor.visit(f"ask/{unplaced[0]}")
+    deny(page)
+    expect(page.get_by_text("Kept: the photo was not taken there.")).to_be_visible()
+    assert city.get(f"/uploads/{unplaced[0]}")["given_place"]["denied"]["radius_m"] > 0
+    page = visitor.visit(f"photo/{unplaced[0]}")
+    page.locator(".facts").get_by_role("button", name="Undo").click()
+    expect(page.locator(".facts")).not_to_contain_text("A person said")
+    assert city.get(f"/uploads/{unplaced[0]}")["given_place"] is None
+
+    page = visitor.visit("ask")
+    page.locator("input[data-use=ask]").set_input_files(city.queries[0])
+    deny(page)
+    expect(page.get_by_text("Kept as a test photo that was not taken there.")).to_be_visible()
+    (kept,) = city.get("/search", filename=city.queries[0].name)["images"]
+    assert (kept["role"], kept["latitude"]) == ("query", None)
+    assert kept["given_place"]["denied"]["latitude"] is not None
+    page.locator(".note").get_by_role("button", name="Undo").click()
+    expect(page.get_by_text("The test photo is removed again.")).to_be_visible()
+    assert city.get("/search", filename=city.queries[0].name)["total_found"] == 0
+    visitor.expect_no_error()
 
 
 def test_a_wrong_answer_becomes_a_test_photo_at_the_true_place_with_a_way_back(

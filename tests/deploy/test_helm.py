@@ -54,11 +54,9 @@ def of_kind(name: str, *kinds: str) -> list[Json]:
 
 
 def component(manifest: Json) -> str:
-    """`gateway`, `search-0`, `migrate`: of the labels, not of the name."""
-    labels = manifest["metadata"]["labels"]
-    shard = labels.get("placewise/shard")
-    part: str = labels["app.kubernetes.io/component"]
-    return part if shard is None else f"{part}-{shard}"
+    """`gateway`, `search`, `migrate`: of the labels, not of the name."""
+    part: str = manifest["metadata"]["labels"]["app.kubernetes.io/component"]
+    return part
 
 
 def by_component(name: str, *kinds: str) -> dict[str, Json]:
@@ -209,7 +207,7 @@ def test_no_manifest_holds_a_secret_and_each_pod_gets_only_its_own(name: str) ->
     }
     as_files = example(name).get("secrets", {}).get("asFiles", False)
     for part, workload in by_component(name, *WORKLOADS).items():
-        names = expected[part.partition("-")[0] if part.startswith("search") else part]
+        names = expected[part] | ({"MILVUS_URI"} if (name, part) == ("milvus", "search") else set())
         assert names <= set(SECRET_SETTINGS)
         volumes = {one["name"]: one for one in pod(workload)["spec"]["volumes"]}
         if as_files:
@@ -226,6 +224,29 @@ def test_no_manifest_holds_a_secret_and_each_pod_gets_only_its_own(name: str) ->
     settings = settings_of(name)
     assert all(setting.lower() in Settings.model_fields for setting in settings)
     assert not set(settings) & set(SECRET_SETTINGS)
+
+
+def test_a_steward_with_an_immich_library_has_what_that_of_the_compose_file_has() -> None:
+    compose = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]["steward"]
+    names = {n for n in compose["environment"] if n.startswith(("IMMICH_", "PLACEWISE_"))}
+    given = variables(by_component("production", "Deployment")["steward"])
+    assert len(names) == 5
+    assert names <= set(given)
+    assert not names & set(variables(by_component("cpu", "Deployment")["steward"]))
+    keys = [
+        given[name]["valueFrom"]["secretKeyRef"] for name in ("IMMICH_API_KEY", "PLACEWISE_KEY")
+    ]
+    assert [key["key"] for key in keys] == ["IMMICH_API_KEY", "ADMIN_KEY"]
+    gateway = by_component("production", "Service")["gateway"]
+    assert gateway["spec"]["ports"][0]["port"] == 80
+    assert given["PLACEWISE_SERVER"]["value"] == f"http://{gateway['metadata']['name']}"
+    (policy,) = (
+        one["spec"]
+        for one in of_kind("production", "NetworkPolicy")
+        if one["metadata"]["name"] == f"{RELEASE}-search-clients"
+    )
+    selector = policy["egress"][-1]["to"][0]["podSelector"]["matchLabels"]
+    assert selector == gateway["spec"]["selector"]
 
 
 def test_an_external_store_fills_the_secret_that_the_pods_read() -> None:
@@ -256,9 +277,7 @@ def test_search_urls_name_every_worker_that_autoscaling_may_start(name: str) -> 
         )
         assert service["spec"]["clusterIP"] == "None"
     assert set(settings_of(name)["SEARCH_URLS"].split(",")) == urls
-    shards = {variables(worker)["SEARCH_SHARD"]["value"] for worker in workers}
-    assert shards == {f"{number}/{len(workers)}" for number in range(len(workers))}
-    assert len(workers) == (3 if name == "production" else 2)
+    assert len(workers) == 1
 
 
 @EACH

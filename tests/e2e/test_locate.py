@@ -77,7 +77,7 @@ def test_a_folder_is_located_by_the_map_and_by_time_written_and_undone(
     for unreadable in ("broken.jpg", "empty.jpg"):
         (trip / unreadable).unlink()
         del before[unreadable]
-    written = locate("--accept", "0.9", "--write", "sidecar")
+    written = locate("--accept", "0.9", "--write")
     assert written.returncode == 0, written.stderr
     assert "of the map.jpg" in written.stdout
     position = sidecar_position((trip / "of the map.jpg.xmp").read_bytes())

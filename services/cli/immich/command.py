@@ -110,7 +110,7 @@ def immich(
             _print_indexed(indexed)
         options = LocateOptions(
             accept, radius, motion, together, gpx, picture, server, map_name, write, as_json,
-            "--write", command_line("immich", "--url", url, "--undo"), "photos",
+            command_line("immich", "--url", url, "--undo"), "photos",
         )  # fmt: skip
         complete = locate_library(
             library, options, lambda: contextlib.nullcontext(client), photos, indexed=indexed

@@ -58,17 +58,16 @@ class ImmichLibrary:
         albums = {
             image["id"]: album["albumName"]
             for album in self._api.albums()
-            for image in self._api.images(albumIds=[album["id"]])
+            for image in self._api.images(albumIds=[album["id"]], withExif=False)
         }
         own = {
-            image["id"]: image
+            image["id"]: _library_photo(image, albums.get(image["id"], ""))
             for image in self._api.images()
             if image["ownerId"] == self._user_id
             and not (image["isTrashed"] or image.get("visibility") == "locked")
         }
         photos: dict[str, LibraryPhoto] = {}
-        for image in own.values():
-            photo = _library_photo(image, albums.get(image["id"], ""))
+        for photo in own.values():
             if photo.name in photos:
                 photo = replace(photo, name=f"{photo.id}/{photo.name}")
             photos[photo.name] = photo

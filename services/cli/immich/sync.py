@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -52,11 +52,13 @@ def sync_map(
         `searchable`, and the photos that `failed`, with reasons.
     """
     located = {photo.id: photo for photo in photos if photo.latitude is not None}
-    stored = _stored_photos(client, library)
-    current = {_id(each): each for each in stored if _is_current(each, located)}
-    changed = 0
-    for photo_id, there in current.items():
-        fields = _fields(located[photo_id])
+    current, outdated, changed = set[str](), set[str](), 0
+    for there in _stored_photos(client, library):
+        if not _is_current(there, located):
+            outdated.add(_id(there))
+            continue
+        current.add(_id(there))
+        fields = _fields(located[_id(there)])
         if fields != {name: _as_json(getattr(there, name)) for name in fields}:
             client.patch_photo(there.image_id, **fields)
             changed += 1
@@ -64,15 +66,15 @@ def sync_map(
     report = upload_photos(client, uploads, progress, update=True)
     failed = report["refused"] + report["failed"]
     failed_paths = {each["path"] for each in failed}
-    gone = {_id(each) for each in stored} - located.keys()
+    gone = outdated - located.keys()
     if gone - {photo.id for photo in photos}:  # a listing may miss what others move meanwhile
         gone -= {photo.id for photo in library.list_photos() if photo.latitude is not None}
-    for each in _stored_photos(client, library):
-        photo = located.get(_id(each))
+    for there in _stored_photos(client, library) if outdated else ():
+        photo = located.get(_id(there))
         is_replaced = photo is not None and str(Path(photo.name)) not in failed_paths
-        if _id(each) in gone or (is_replaced and not _is_current(each, located)):
+        if _id(there) in gone or (is_replaced and not _is_current(there, located)):
             with contextlib.suppress(NotFound):  # somebody else was faster
-                client.delete_photo(each.image_id)
+                client.delete_photo(there.image_id)
     return {
         "with_coordinates": len(located),
         "indexed": len(uploads) - len(failed),
@@ -83,9 +85,9 @@ def sync_map(
     }
 
 
-def _stored_photos(client: Client, library: PhotoLibrary) -> list[Photo]:
+def _stored_photos(client: Client, library: PhotoLibrary) -> Iterator[Photo]:
     photos = client.photos(tags=library.identity)
-    return [each for each in photos if "library_id" in each.metadata]
+    return (each for each in photos if "library_id" in each.metadata)
 
 
 def _id(photo: Photo) -> str:

@@ -10,7 +10,7 @@ import typer
 
 from services.cli.client import connect
 from services.cli.locate.proposals import LocateOptions, locate_library, report_undo
-from services.cli.locate.writers import FolderLibrary, Target
+from services.cli.locate.writers import FolderLibrary
 from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption, TimeZoneOption
 from shared.config.command_line import command_line
 from shared.tracks.motion import MOTION_MODELS
@@ -62,12 +62,12 @@ def locate(
     accept: AcceptOption = 0.95,
     radius: RadiusOption = 100.0,
     write: Annotated[
-        Target | None,
+        bool,
         typer.Option(
-            help="Write the accepted proposals: XMP sidecars, or a CSV table in DIR. Without it, "
-            "nothing is written."
+            "--write",
+            help="Write the accepted proposals into XMP sidecars. Without it, nothing is written.",
         ),
-    ] = None,
+    ] = False,
     undo_changes: Annotated[
         bool, typer.Option("--undo", help="Restore all files that --write has changed in DIR.")
     ] = False,
@@ -87,15 +87,15 @@ def locate(
     taken shortly before and after and have coordinates, and a GPX track. Coordinates that a photo
     has are never changed.
     """
-    library = FolderLibrary(folder, write or Target.SIDECAR, time_zone, clock_offset)
+    library = FolderLibrary(folder, time_zone, clock_offset)
     if undo_changes:
         undone = library.undo()
         message = f"{len(undone.restored)} files restored, {len(undone.removed)} removed."
         report_undo(undone, message, as_json)
         return
     options = LocateOptions(
-        accept, radius, motion, together, gpx, picture, server, map_name, bool(write), as_json,
-        "--write sidecar or csv", command_line("locate", folder, "--undo"), "files",
+        accept, radius, motion, together, gpx, picture, server, map_name, write, as_json,
+        command_line("locate", folder, "--undo"), "files",
     )  # fmt: skip
     if not locate_library(library, options, partial(connect, server, map_name, key)):
         raise typer.Exit(1)

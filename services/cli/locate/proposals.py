@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -73,7 +73,6 @@ class LocateOptions:
     map_name: str | None
     write: bool
     as_json: bool
-    how_to_write: str
     undo_command: str
     written_are: str
     """in the plural, such as files"""
@@ -125,14 +124,7 @@ def locate_library(
     located = [_locate_photo(photo, searches.get(photo.name), finder) for photo in unlocated]
     accept_from = max(options.accept, 1e-9)
     accepted = [each for each in located if each.probability >= accept_from]
-    written = None
-    if options.write:
-        # A place is written only if it is accepted, too.
-        located_surely = [
-            each if (each.place_probability or 0.0) >= accept_from else replace(each, place=None)
-            for each in accepted
-        ]
-        written = library.write(located_surely)
+    written = library.write(accepted) if options.write else None
     if options.as_json:
         print_json(_to_json(photos, located, options.accept, written) | more_json)
     else:
@@ -295,7 +287,7 @@ def _print_proposals(
         )
     if written is None:
         if accepted:
-            print_note(f"Nothing is written. {options.how_to_write} writes them.")
+            print_note("Nothing is written. --write writes them.")
         return
     names = printable_text(first_names(written.written))
     print_note(

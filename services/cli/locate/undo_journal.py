@@ -38,7 +38,7 @@ class UndoJournal:
         self._journal = self._folder / JOURNAL
         for name in (BACKUPS, STAGED):
             (self._folder / name).mkdir(exist_ok=True)
-        lines = _read_lines(self._journal)
+        lines = read_journal(self._journal, _check_line)
         repair_journal(self._journal, lines)
         self._known: dict[str, set[str | None]] = {}  # path -> SHA-256 of what undo may discard
         for line in lines:
@@ -114,7 +114,7 @@ def undo(root: Path) -> UndoReport:
     with _exclusive(root):
         originals: dict[str, Json] = {}
         written: dict[str, set[str]] = {}
-        for line in _read_lines(folder / JOURNAL):
+        for line in read_journal(folder / JOURNAL, _check_line):
             if line["backup"] is not None:
                 originals[line["path"]] = line
             originals.setdefault(line["path"], line)
@@ -164,13 +164,6 @@ def _exclusive(root: Path) -> Iterator[None]:
         raise Misconfigured(
             "out_unwritable", f"Can't change files in {printable_path(root)}: {error}."
         ) from error
-
-
-def _read_lines(journal: Path) -> list[Json]:
-    return [
-        {key: line[key] for key in ("path", "before", "after", "backup")}
-        for line in read_journal(journal, _check_line)
-    ]
 
 
 def _check_line(line: Json) -> None:

@@ -32,7 +32,7 @@ from sqlalchemy.orm import Session
 from shared.catalog.database.base import count_rows, db_now
 from shared.catalog.database.session import NO_TIMEOUTS, Catalog
 from shared.catalog.installation import Installation
-from shared.catalog.photos import Photo
+from shared.catalog.photos import Photo, is_kept
 from shared.config.private_files import FILE_MODE, make_private_folder, write_private
 from shared.errors import Conflict, Misconfigured, NotFound, Unavailable
 from shared.integrity.referenced_objects import list_referenced_objects
@@ -88,6 +88,7 @@ class BackupManifest:
     index: str
     """Name of the list of objects."""
     photos: int
+    """Those in the trash included."""
     objects: int
     object_bytes: int
     missing: list[str] = field(default_factory=list)
@@ -226,7 +227,7 @@ class _Backup:
                 # The first statement starts the snapshot of the database.
                 made_at = session.execute(select(db_now())).scalar_one()
                 journal = self._copy_journal(session)
-                photos = count_rows(session, select(Photo.id).where(Photo.deleted_at.is_(None)))
+                photos = count_rows(session, select(Photo.id).where(is_kept()))
                 expected = {r.key: r.sha256 for r in list_referenced_objects(session)}
             if journal:
                 break

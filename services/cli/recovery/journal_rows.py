@@ -284,7 +284,8 @@ class _RowPreparation:
             "revision": line.revision,
             "journaled_revision": line.revision,
         }
-        if columns.get("deleted_at") is not None:
+        purge_at = columns.get("purge_at")  # of a photo in the trash, which stays there
+        if columns.get("deleted_at") and not (purge_at and purge_at > datetime.now(UTC)):
             return None
         if line.table == "photos":
             return columns if self._is_recoverable_photo(line, columns) else None

@@ -53,7 +53,7 @@ def to_unavailable(error: BaseException) -> Unavailable | None:
         return StorageFull(
             "disk_full",
             "The catalog's disk is full; nothing was changed. Free disk space on it, or "
-            "delete photos or maps.",
+            "empty the trash of photos, or delete maps.",
             retry_after_seconds=FULL_RETRY_SECONDS,
         )
     if sqlite.startswith(DAMAGED) or state in POSTGRES_DAMAGED:

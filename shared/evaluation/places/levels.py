@@ -100,6 +100,17 @@ class CandidateLevel:
         ends_above = self.is_path and bool(levels) and is_within_level(self.place, levels[0])
         return None if ends_above or not levels else False
 
+    def is_within(self, other: CandidateLevel) -> bool:
+        """Return whether the level is another one, or a finer one of its path.
+
+        Circles are compared by the position of the other one, and by their sizes.
+        """
+        if self.radius_m is None:
+            place = PhotoLocation(None, None, self.place)
+            return replace(other, is_path=self.is_path).contains(place)
+        center = PhotoLocation(other.latitude, other.longitude, None)
+        return self.radius_m <= (other.radius_m or 0.0) and self.contains(center)
+
 
 def candidate_levels(
     ranking: Sequence[RankedPhoto],

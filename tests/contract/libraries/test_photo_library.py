@@ -18,7 +18,7 @@ from services.cli.immich.library import ImmichLibrary
 from services.cli.locate.library import LibraryPhoto, LocatedPhoto, PhotoLibrary
 from services.cli.locate.sidecars import add_position
 from services.cli.locate.undo_journal import FOLDER
-from services.cli.locate.writers import FolderLibrary, Target
+from services.cli.locate.writers import FolderLibrary
 from shared.errors import Conflict, NotFound, Unprocessable
 from shared.geotagging.fusion import Proposal
 from tests.support.immich_server import KEY, NOON, ImmichServer, running_immich
@@ -52,7 +52,7 @@ class FolderCase(Case):
         self.folder.mkdir()
         self.journal = self.folder / FOLDER / "journal.jsonl"
         self.lock = self.journal.with_name("lock")
-        self.library = FolderLibrary(self.folder, Target.SIDECAR)
+        self.library = FolderLibrary(self.folder)
 
     def add(self, number: int, seconds: float, position: tuple[float, float] | None) -> str:
         exif = exif_with_position(*position) if position else Image.Exif()

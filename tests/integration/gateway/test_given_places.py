@@ -99,7 +99,7 @@ def test_a_place_is_given_and_taken_back(service: Service) -> None:
     assert (shown["latitude"], shown["longitude"]) == (45.0, 7.0)
     given = shown["given_place"]
     assert (given["probability"], given["reason"]) == (0.97, "looks alike")
-    assert given.keys() == {"probability", "reason", "given_at"}
+    assert given.keys() == {"probability", "reason", "given_at", "denied"}
     listed = service.json("GET", "/search", params={"place_given": True})
     assert [each["image_id"] for each in listed["images"]] == [photo]
     assert propose(service)["total"] == 0
@@ -112,6 +112,25 @@ def test_a_place_is_given_and_taken_back(service: Service) -> None:
     assert [each["image_id"] for each in without["images"]] == [photo]
     again = service.json("POST", "/places/undo", json={"file_ids": [photo]})
     assert again == {"restored": [], "changed_since": []}
+
+
+def test_a_denied_place_is_kept_and_not_proposed_until_that_is_taken_back(
+    service: Service,
+) -> None:
+    stored(service, 1, taken(0), latitude=45.0, longitude=7.0)
+    photo = stored(service, 2, taken(20))
+    (proposal,) = propose(service)["proposals"]
+    denied = {name: proposal[name] for name in ("latitude", "longitude", "radius_m")}
+    assert give(service, file_id=photo, **denied, denied=True)["given"] == [photo]
+    shown = service.json("GET", f"/uploads/{photo}")
+    assert shown["latitude"] is None
+    assert shown["given_place"]["denied"] == {**denied, "place": None}
+    (left_out,) = propose(service)["proposals"]
+    assert left_out["latitude"] is None
+    assert left_out["error"].startswith("A person said that it was not taken")
+    undone = service.json("POST", "/places/undo", json={"file_ids": [photo]})
+    assert undone["restored"] == [photo]
+    assert propose(service)["proposals"] == [proposal]
 
 
 def test_what_has_changed_since_is_left_alone_and_named(service: Service) -> None:

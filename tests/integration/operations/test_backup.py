@@ -218,7 +218,7 @@ def test_a_backup_taken_again_copies_only_what_is_new_and_forgets_what_is_gone(
     back_up(on_call)
     assert read == []
     gone = original_of(service, first)
-    assert service("DELETE", f"/uploads/{first}").is_success
+    service.json("DELETE", f"/uploads/{first}", params={"permanently": True})
     service.store.delete(gone)  # as the steward does
     service.upload(photo_bytes(3))
     manifest = back_up(on_call)
@@ -253,7 +253,7 @@ def test_what_comes_or_goes_while_a_backup_is_taken_is_in_it_or_not_restored_fro
                 service.upload(photo_bytes(5))
                 write_journal(service.catalog, service.store)
                 for file_id in gone:
-                    assert service("DELETE", f"/uploads/{file_id}").is_success
+                    service.json("DELETE", f"/uploads/{file_id}", params={"permanently": True})
                     service.store.delete(original_of(service, file_id))
 
     gone: list[str] = []
@@ -317,7 +317,7 @@ def test_a_backup_killed_while_it_deletes_old_objects_can_be_restored_and_delete
 ) -> None:
     gone, _ = service.indexed(1, 2)
     back_up()
-    service.json("DELETE", f"/uploads/{gone}")
+    service.json("DELETE", f"/uploads/{gone}", params={"permanently": True})
     original = original_of(service, gone)
     service.store.delete(original)
     service.store.delete(thumbnail_key(UUID(gone)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from datetime import timedelta
 from functools import partial
 from typing import Any
 from uuid import UUID, uuid4
@@ -93,8 +94,8 @@ def answers(service: Service, file_id: str, map_name: str = "default") -> Any:
 
 
 def two_maps(service: Service) -> dict[str, str]:
-    """Photos of two maps of two extractors, a labelled query, one that was patched and one that was
-    deleted: the map of each that is left."""
+    """Photos of two maps of two extractors, a labelled query, one that was patched and one in the
+    trash: the map of each that is left."""
     service.json("POST", "/maps", 201, json={"name": "halls", "extractor": "test-tiny-vlad"})
     first, second, gone = service.indexed(1, 2, 3, **SAID)
     nowhere = {"place": "bridge", "latitude": None, "longitude": None}
@@ -129,19 +130,22 @@ def test_every_photo_is_searchable_again_with_its_metadata(
     fields = {file_id: photo(service, file_id, name) for file_id, name in left.items()}
     before = {file_id: answers(service, file_id, name) for file_id, name in left.items()}
     assert all(before.values())
+    removed = service.json("GET", "/search", params={"removed": True})["images"]
 
     lose_catalog(service.catalog)
     with service.catalog.write() as session:
         get_or_create_default_map(session, settings.extractor)  # as a first start has left it
     service, taken = rebuilt(service)
-    assert (taken.maps, taken.photos, taken.queued_photos) == (2, 6, 0)
-    assert taken.descriptors == 6
+    assert (taken.maps, taken.photos, taken.queued_photos) == (2, 7, 0)
+    assert taken.descriptors == 7
     assert taken.unnamed_photos == taken.lost_originals == 0
     assert {file_id: photo(service, file_id, name) for file_id, name in left.items()} == fields
     assert {file_id: answers(service, file_id, name) for file_id, name in left.items()} == before
     with service.catalog.read() as session:
         assert session.scalars(select(Installation.id)).one() == installation_id
-        assert session.scalar(select(func.count()).select_from(Photo)) == 6
+        in_trash = session.scalars(select(Photo).where(Photo.deleted_at.is_not(None))).one()
+        assert in_trash.purge_at - in_trash.deleted_at == timedelta(days=30)
+    assert service.json("GET", "/search", params={"removed": True})["images"] == removed
     assert verify_store(service.catalog, store, originals=True).faults == []
     check_not_behind(service.catalog, store)
     maps = service.json("GET", "/maps")
@@ -151,7 +155,7 @@ def test_every_photo_is_searchable_again_with_its_metadata(
     (new,) = service.indexed(7, map_name="halls")
     assert answers(service, new, "halls")
     assert write_journal(service.catalog, store) > 0
-    assert collect_orphans(service.catalog, store, -1.0) > 0  # the deleted photo's and map's
+    assert collect_orphans(service.catalog, store, -1.0) > 0  # the deleted map's
     assert verify_store(service.catalog, store, originals=True).faults == []
 
 
@@ -301,7 +305,7 @@ def test_a_model_change_of_a_snapshot_that_nothing_follows_is_finished(
         generation_id = session.scalars(building).one()
     lose_catalog(service.catalog)
     service, report = rebuilt(service)
-    assert report.descriptors == 6 + 3
+    assert report.descriptors == 7 + 3
     for _ in range(5):
         service.drain()
         service.search.sync()
@@ -359,7 +363,7 @@ def test_merged_chunks_give_each_photo_one_row(
 ) -> None:
     file_ids = [service.indexed(number)[0] for number in (1, 2, 3)]
     assert (
-        merge_small_chunks(service.catalog, store, compact_chunks=2) == 1
+        merge_small_chunks(service.catalog, store, settings, compact_chunks=2) == 1
     )  # the three lie there still
     file_ids += service.indexed(4)
     write_journal(service.catalog, store)

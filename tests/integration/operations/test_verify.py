@@ -50,7 +50,7 @@ def test_an_intact_store_has_no_faults_and_deleted_photos_need_no_objects(
     assert report.read_bytes > 0
     with service.catalog.read() as session:
         key = session.get_one(Photo, UUID(first)).object_key
-    assert service("DELETE", f"/uploads/{first}").is_success
+    service.json("DELETE", f"/uploads/{first}", params={"permanently": True})
     service.store.delete(key)
     assert looked(service, originals=True).faults == []
 

@@ -9,7 +9,6 @@ from uuid import UUID
 import pytest
 import sqlalchemy as sql
 
-from services.steward.tasks.compaction import merge_slot
 from services.steward.tasks.garbage_collection import collect_superseded_chunks
 from shared.catalog.chunks import Descriptor
 from shared.catalog.database.session import Catalog
@@ -25,7 +24,7 @@ from shared.search_api.protocol import (
 )
 from tests.integration.evaluated_map import EvaluatedMap, Watched
 from tests.integration.steward.streets import HOUR, NOON, STREETS, WITHOUT_PLACE, at, query
-from tests.support.catalog_rows import delete, read_job
+from tests.support.catalog_rows import delete, merge_all, read_job
 
 
 def test_leave_one_out_recall_is_what_one_counts_by_hand(city: EvaluatedMap) -> None:
@@ -181,6 +180,28 @@ def test_queries_of_the_session_of_their_match_refine_no_probability(
     assert refined != same
 
 
+@pytest.mark.parametrize("known", [38, 39])
+def test_denied_places_teach_beside_enough_queries_whose_place_is_known(
+    city: EvaluatedMap, known: int
+) -> None:
+    city.publish([(6 * n, at(n)) for n in range(60)])
+    city.publish([(6 * n + 1, query(**at(n))) for n in range(known)])
+    denied = [{**at(n), "radius_m": 100.0, "place": None} for n in range(40, 60)]
+    rows = [query(given_place={"probability": None, "denied": each}) for each in denied]
+    rows[0] |= at(0)  # the true place is known meanwhile
+    rows[1]["given_place"] = {"probability": None}  # a given place that was cleared
+    city.publish([(6 * n + 1, row) for n, row in enumerate(rows, 40)])
+    figures = city.figures()
+    labelled = figures["labelled_queries"]
+    assert (labelled["queries"], labelled["out_of_map"], labelled["denied"]) == (known + 1, 0, 18)
+    places = figures["places"] or {"source": None}
+    assert (places["source"] == "labelled_queries") == (known == 39)
+    if known == 39:
+        assert places["samples"] == 40 + 18
+        assert places["levels"][0]["accuracy"] == pytest.approx(39 / (40 + 18))
+    assert city.evaluations()[-1].labelled_queries == known + 1
+
+
 def test_a_photo_deleted_meanwhile_counts_neither_way(city: EvaluatedMap, catalog: Catalog) -> None:
     photo_ids = city.publish([(0, at(0)), (1, at(0)), (90, at(1)), (91, at(1))])
     asking = city.publish([(2, query(**at(0))), (92, query(**at(1)))])
@@ -211,7 +232,7 @@ def test_chunks_merged_and_removed_meanwhile_change_no_figure(city: EvaluatedMap
     before = city.figures()["leave_one_out"]
 
     def merge() -> None:
-        assert merge_slot(city.catalog, city.store, city.generation_id, 0)
+        assert merge_all(city.catalog, city.store, city.generation_id)
         collect_superseded_chunks(city.catalog, city.store, grace_seconds=0)
         city.search.sync()
 

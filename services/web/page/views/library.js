@@ -21,6 +21,6 @@ export async function drawLibrary(card, signal) {
       h("dt", {}, "Without"), h("dd", {}, `${count(result.without_coordinates)}, of which ${count(result.located)} can be located`),
       h("dt", {}, "In the last run"), h("dd", {}, `${count(result.indexed)} indexed, ${count(result.changed)} changed, ${count(result.removed)} removed`)),
     result?.failed.length > 0 && h("details", {}, h("summary", {}, `${plural(result.failed.length, "photo")} failed`), h("ul", {}, result.failed.map(({ path, reason }) => h("li", {}, `${path}: ${reason}`)))),
-    h("p", { class: "soft small" }, "Last run: ", job.finished_at ? time(job.finished_at) : "now", hours ? `; every ${plural(hours, "hour")}` : "; no schedule", ". Nothing is written into the library: ", h("code", {}, "placewise immich --write"), " does."),
+    h("p", { class: "soft small" }, "Last run: ", job.finished_at ? time(job.finished_at) : "now", hours ? `; every ${plural(hours, "hour")}` : "; no schedule", ". Nothing is written into the library: ", h("code", {}, "placewise immich --write"), " does. The calls are those of the description of Immich 3.2.2; it was never run against a real Immich."),
     job.finished_at && h("p", { class: "row" }, button("Update now", again)));
 }

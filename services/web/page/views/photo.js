@@ -65,7 +65,7 @@ function facts(photo, job, reload) {
   return h("dl", { class: "facts" },
     line("Searchable", job?.state === "failed" ? h("span", { class: "bad" }, `no. ${job.error.detail}`) : state),
     photo.latitude !== null && line("Position", [degrees(photo.latitude, photo.longitude), coordinateTools(photo.latitude, photo.longitude)]),
-    photo.given_place && line("Given", [givenInWords(photo), " ", button("Undo", async () => {
+    photo.given_place && line(photo.given_place.denied ? "Not there" : "Given", [givenInWords(photo), " ", button("Undo", async () => {
       await undoPlaces([photo.image_id]);
       reload();
     }, "link")]),

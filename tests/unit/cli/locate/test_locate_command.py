@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import json
 import os
 from collections.abc import Sequence
@@ -25,7 +24,6 @@ from services.cli.locate.folder import read_folder, read_gpx
 from services.cli.locate.sidecars import EMPTY_SIDECAR, add_position
 from services.cli.main import build_app
 from shared.errors import InvalidRequest
-from shared.ingest.photo_metadata import read_csv_manifest
 from tests.support.api_responses import PHOTO, POSE, SIMILAR, STATS
 from tests.support.fake_server import FakeServer
 from tests.support.photos import encoded, exif_with_position, photo_image
@@ -145,20 +143,13 @@ def test_tracks_without_times_are_refused(tmp_path: Path) -> None:
         assert refusal.value.code == "bad_gpx"
 
 
-def test_a_sidecar_with_coordinates_counts_as_coordinates_of_the_photo(folder: Path) -> None:
-    (folder / "4.jpg.xmp").write_bytes(add_position(None, LATITUDE, LONGITUDE, 5.0))
-    photos = {each.name: each for each in read_folder(folder, None, 0.0)}
-    assert photos["4.jpg"].latitude == pytest.approx(LATITUDE, abs=1e-6)
-    assert proposals(folder).keys() == {"day 1/2.jpg"}
-
-
 def test_a_photo_whose_gps_tag_is_not_understood_is_named_and_never_written(folder: Path) -> None:
     unread = folder / "day 1" / "2.jpg"
     with pyexiv2.Image(str(unread)) as image:
         image.modify_exif({"Exif.GPSInfo.GPSLatitude": "45/1 4/1 12/1"})
     (folder / "4.jpg.xmp").write_bytes(b"no XML")
     before = contents(folder)
-    result = run(folder, "--together", "--write", "sidecar")
+    result = run(folder, "--together", "--write")
     assert "day 1/2.jpg: its latitude has no letter N or S" in result.stderr
     assert "4.jpg: its XMP is damaged" in result.stderr
     assert before.items() <= contents(folder).items()
@@ -215,7 +206,7 @@ def test_a_sidecar_keeps_its_owner_group_mode_and_attributes(
         return status.st_uid, status.st_gid, status.st_mode, [os.getxattr(path, n) for n in names]
 
     before, content = attributes(), path.read_bytes()
-    assert run(folder, "--write", "sidecar").exit_code == 0
+    assert run(folder, "--write").exit_code == 0
     assert path.read_bytes() != content
     assert attributes() == before
     monkeypatch.setattr("os.link", Mock(side_effect=OSError("no hard links")))
@@ -238,7 +229,7 @@ def test_a_sidecar_whose_owner_would_change_is_left_as_it_is(
 
     monkeypatch.setattr(Path, "stat", of_another_user)
     monkeypatch.setattr("os.chown", Mock(side_effect=PermissionError))
-    result = run(folder, "--write", "sidecar")
+    result = run(folder, "--write")
     assert result.exit_code == 1
     assert "belongs to user" in result.stderr
     assert {n: c for n, c in contents(folder).items() if "placewise" not in n} == before
@@ -246,7 +237,7 @@ def test_a_sidecar_whose_owner_would_change_is_left_as_it_is(
 
 def test_a_name_that_is_too_long_for_a_sidecar_stops_only_its_own_photo(folder: Path) -> None:
     (folder / f"{'x' * 249}.jpg").write_bytes(photo(30))
-    result = run(folder, "--write", "sidecar")
+    result = run(folder, "--write")
     assert result.exit_code == 1
     assert "xxx.jpg: can't be written: File name too long" in result.stderr
     assert (folder / "day 1" / "2.jpg.xmp").exists()
@@ -255,12 +246,12 @@ def test_a_name_that_is_too_long_for_a_sidecar_stops_only_its_own_photo(folder: 
 def test_what_is_no_regular_file_is_never_opened(folder: Path) -> None:
     os.mkfifo(folder / "day 1" / "2.jpg.xmp")
     os.mkfifo(folder / "5.jpg")
-    result = run(folder, "--write", "sidecar")  # it would wait for ever
+    result = run(folder, "--write")  # it would wait for ever
     assert result.exit_code == 1
     assert "2.jpg.xmp is not a regular file" in result.stderr
     assert "5.jpg" not in result.stdout
     os.mkfifo(folder / undo_journal.FOLDER / "lock2")
-    for arguments in (("--write", "sidecar"), ("--undo",)):
+    for arguments in (("--write",), ("--undo",)):
         refused = run(folder, *arguments)
         assert "out_unwritable" in refused.stderr
 
@@ -269,7 +260,7 @@ def test_control_characters_of_names_do_not_reach_the_terminal(folder: Path) -> 
     name = "\x1b]0;title\x9b31m\nfake\trow.jpg"
     (folder / name).write_bytes(photo(30))
     os.mkfifo(folder / f"{name}.xmp")
-    result = run(folder, "--write", "sidecar")
+    result = run(folder, "--write")
     shown = "\ufffd]0;title\ufffd31m"
     assert not set("\x1b\x9b") & set(result.output)
     (row,) = [line for line in result.stdout.splitlines() if "title" in line]
@@ -278,25 +269,6 @@ def test_control_characters_of_names_do_not_reach_the_terminal(folder: Path) -> 
     as_json = run(folder, "--json")
     assert not set("\x1b\x9b") & set(as_json.output)
     assert name in {each["filename"] for each in json.loads(as_json.stdout)["proposals"]}
-
-
-def test_a_table_can_be_indexed(folder: Path) -> None:
-    assert run(folder, "--write", "csv").exit_code == 0
-    table = folder / "placewise-locations.csv"
-    entries = read_csv_manifest(table.read_bytes(), "table")
-    assert [entry.name for entry in entries] == ["day 1/2.jpg"]
-    assert entries[0].fields.keys() == {"latitude", "longitude"}
-    assert table.read_text().startswith("filename,latitude,longitude,heading,place\n")
-    assert run(folder, "--undo").exit_code == 0
-    assert not list(folder.glob("placewise-locations*"))
-
-
-def test_a_name_in_a_table_is_no_formula_for_a_spreadsheet(folder: Path) -> None:
-    (folder / "day 1" / "2.jpg").rename(folder / "=2.jpg")
-    assert run(folder, "--write", "csv").exit_code == 0
-    table = (folder / "placewise-locations.csv").read_bytes()
-    assert b"\n'=2.jpg," in table
-    assert [entry.name for entry in read_csv_manifest(table, "table")] == ["=2.jpg"]
 
 
 def answer(**changes: Any) -> dict[str, Any]:
@@ -368,18 +340,17 @@ def test_what_a_preview_has_shown_is_written_although_the_map_answers_differentl
     (folder / "new.jpg").write_bytes(photo(None))
     sure = [{"latitude": 44.0, "longitude": 7.0, "radius_m": 25.0, "probability": 1.0}]
     will_find(server, answer(estimate=estimate(0.0, sure)))
-    written = searched(server, folder, "--write", "csv")
+    written = searched(server, folder, "--write")
     assert written.exit_code == 0, written.output
     assert "1 proposals are not as they were accepted then" in written.stderr
     assert written.stderr.rstrip().endswith(": new.jpg")
-    rows = (folder / "placewise-locations.csv").read_text().splitlines()[1:]
-    coordinates = {
-        name: (latitude, longitude) for name, latitude, longitude, *_ in csv.reader(rows)
+    written_now = read_folder(folder, None, 0.0)
+    latitudes = {
+        each.name: each.latitude for each in written_now if (folder / f"{each.id}.xmp").exists()
     }
     for name, each in shown.items():
-        position = each["position"]
-        assert coordinates.pop(name) == (str(position["latitude"]), str(position["longitude"]))
-    assert coordinates.keys() == {"new.jpg"}
+        assert latitudes.pop(name) == pytest.approx(each["position"]["latitude"], abs=1e-6)
+    assert latitudes == {"new.jpg": pytest.approx(44.0)}
 
 
 def test_no_photo_of_a_preview_is_searched_again_unless_it_has_changed_or_a_day_has_passed(
@@ -388,21 +359,23 @@ def test_no_photo_of_a_preview_is_searched_again_unless_it_has_changed_or_a_day_
     will_find(server, answer(), answer())
     shown = searched(server, folder)
     requests = len(server.requests)
-    written = searched(server, folder, "--write", "csv")
+    written = searched(server, folder, "--write")
     assert written.exit_code == 0, written.output
     assert len(server.requests) == requests
     assert written.stdout == shown.stdout
     assert "All proposals are as they were then." in written.stderr
+    assert run(folder, "--undo").exit_code == 0
     (folder / "4.jpg").write_bytes(photo(26, camera="another"))
     will_find(server, answer(estimate=estimate(None, [])))
-    written = searched(server, folder, "--write", "csv")
+    written = searched(server, folder, "--write")
     assert written.stderr.rstrip().endswith(": 4.jpg")
+    assert run(folder, "--undo").exit_code == 0
     old = datetime.now(UTC) - preview.KEPT_FOR
     for file in (Path(os.environ["PLACEWISE_HOME"]) / "locate").iterdir():
         kept = preview.PREVIEW.validate_json(file.read_bytes())
         file.write_bytes(preview.PREVIEW.dump_json(replace(kept, searched_at=old)))
     will_find(server, answer(), answer())
-    assert "The searches are those of" not in searched(server, folder, "--write", "csv").stderr
+    assert "The searches are those of" not in searched(server, folder, "--write").stderr
 
 
 def test_a_map_with_labels_only_gives_places(folder: Path, server: FakeServer) -> None:
@@ -414,10 +387,8 @@ def test_a_map_with_labels_only_gives_places(folder: Path, server: FakeServer) -
     will_find(server, by_label, by_label)
     found = searched_proposals(server, folder)["4.jpg"]
     assert (found["place"], found["accepted"], found["position"]) == ("tower/floor 7", True, None)
-    result = searched(server, folder, "--write", "sidecar")
-    assert (result.exit_code, "--write csv" in result.stderr) == (1, True)
-    assert searched(server, folder, "--write", "csv").exit_code == 0
-    assert "4.jpg,,,,tower/floor 7" in (folder / "placewise-locations.csv").read_text()
+    result = searched(server, folder, "--write")
+    assert (result.exit_code, "which --json prints" in result.stderr) == (1, True)
 
 
 def test_heading_and_position_of_a_pose_are_written(folder: Path, server: FakeServer) -> None:
@@ -429,28 +400,9 @@ def test_heading_and_position_of_a_pose_are_written(folder: Path, server: FakeSe
     assert (found["heading"], "pose to 0.4 m" in found["reason"]) == (POSE["heading"], True)
     assert found["latitude"] == pytest.approx(LATITUDE + north, abs=0.1 * DEGREES_PER_M)
     assert found["radius_68_m"] < 1
-    assert searched(server, folder, "--write", "csv").exit_code == 0
-    table = (folder / "placewise-locations.csv").read_bytes()
-    entries = {entry.name: entry.fields for entry in read_csv_manifest(table, "table")}
-    assert float(entries["day 1/2.jpg"]["heading"]) == POSE["heading"]
-    assert searched(server, folder, "--write", "sidecar").exit_code == 0
+    assert searched(server, folder, "--write").exit_code == 0
     sidecar = (folder / "day 1" / "2.jpg.xmp").read_text()
     assert 'GPSImgDirection="33804/100"' in sidecar
-
-
-def test_a_place_that_is_not_probable_enough_is_not_written_with_the_position(
-    folder: Path, server: FakeServer
-) -> None:
-    levels = [{"place": "tower/floor 7", "probability": 0.3}]
-    unsure = answer(estimate=estimate(0.4, levels))
-    will_find(server, unsure, unsure)
-    found = searched_proposals(server, folder)["day 1/2.jpg"]
-    place = (found["accepted"], found["place"], found["place_probability"])
-    assert place == (True, "tower/floor 7", 0.3)
-    assert searched(server, folder, "--write", "csv").exit_code == 0
-    table = (folder / "placewise-locations.csv").read_bytes()
-    entries = {entry.name: entry.fields.keys() for entry in read_csv_manifest(table, "table")}
-    assert entries["day 1/2.jpg"] == {"latitude", "longitude"}
 
 
 def test_a_sidecar_that_is_changed_while_it_is_written_keeps_the_change(
@@ -463,6 +415,6 @@ def test_a_sidecar_that_is_changed_while_it_is_written_keeps_the_change(
         return add_position(*arguments)
 
     monkeypatch.setattr(writers, "add_position", add_slowly)
-    result = run(folder, "--write", "sidecar")
+    result = run(folder, "--write")
     assert (result.exit_code, "changed the file meanwhile" in result.stderr) == (1, True)
     assert sidecar.read_bytes() == EMPTY_SIDECAR

@@ -208,16 +208,3 @@ def test_an_undo_that_was_killed_is_finished_by_the_next(folder: Path) -> None:
         if not killed:
             break
     assert moment > 5
-
-
-def test_files_are_copied_where_hard_links_are_not_possible(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(source: Path, target: Path) -> None:
-        raise PermissionError
-
-    monkeypatch.setattr(os, "link", refuse)
-    before = contents(folder)
-    write(folder, "old.xmp", b"ours")
-    undo(folder)
-    assert contents(folder) == before
