@@ -167,7 +167,7 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         url = reachable_url(host, port)
         stack.enter_context(announce_server(home, url, local_key))
 
-        search = SearchWorker(catalog, store, settings)
+        search = SearchWorker.from_settings(catalog, store, settings)
         heartbeat = WorkerHeartbeat(catalog, search, name)
         steward_metrics = StewardMetrics(registry)
         steward = Scheduler(catalog, store, wakeups, settings, steward_metrics)

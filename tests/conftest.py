@@ -25,9 +25,11 @@ from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.storage import FolderStore
 from tests.support.servers import (
+    MilvusServer,
     PostgresServer,
     RedisServer,
     S3Server,
+    start_milvus,
     start_moto,
     start_postgres,
     start_redis,
@@ -39,7 +41,7 @@ REAL_PHOTOS = "PLACEWISE_TEST_DATA"
 BROWSER = "PLACEWISE_TEST_BROWSER"
 IMAGES = "PLACEWISE_TEST_IMAGES"
 CHAOS = "PLACEWISE_TEST_CHAOS"
-SERVER_FIXTURES = frozenset({"postgres", "redis", "s3", "moto"})
+SERVER_FIXTURES = frozenset({"milvus_server", "postgres", "redis", "s3", "moto"})
 SERVER_PARAMETERS = frozenset({"postgresql", "redis", "s3", "moto", "bucket"})
 TESTS = Path(__file__).parent
 # The kinds with the longest files first: a long file that starts last runs alone.
@@ -172,6 +174,13 @@ def redis() -> Iterator[RedisServer]:
 def s3() -> Iterator[S3Server]:
     """A real S3 server, as above."""
     with start_s3() as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def milvus_server() -> Iterator[MilvusServer]:
+    """A real Milvus, from the wheel."""
+    with start_milvus() as server:
         yield server
 
 

@@ -84,7 +84,7 @@ def bench(
                 _measure_cpu(report, fleet, jpegs, at, photos, batch)
                 progress.advance(bar)
         with open_fleet(servers, extractor=EXTRACTOR.format(widths[0])) as fleet:
-            fleet.start("search-0-0", "gateway-0")
+            fleet.start("search-0", "gateway-0")
             _measure_uploads(report, fleet, jpegs, photos, rounds)
             progress.advance(bar)
 

@@ -68,7 +68,7 @@ class SyntheticMap:
             session.execute(insert(Photo), photos)
         ids = [photo["id"] for photo in photos]
         stored = rows.astype(RowType.FLOAT16)
-        add_chunk(self.catalog, self.store, self.generation_id, ids, CHUNK_ROWS, stored)
+        add_chunk(self.catalog, self.store, self.generation_id, ids, stored)
         self.photo_ids += ids
 
     def chunk_paths(self) -> list[Path]:

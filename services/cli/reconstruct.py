@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 from uuid import UUID
@@ -11,12 +10,11 @@ from uuid import UUID
 import typer
 from pydantic import TypeAdapter, ValidationError
 from rich.markup import escape
-from rich.progress import Progress
 from rich.table import Column
 
-from placewise.answers import Component, CoordinateProposal, Reconstruction
+from placewise.answers import Component, Reconstruction
 from placewise.client import Client
-from services.cli.client import client_command, connect, wait_for_job
+from services.cli.client import connect, wait_for_job
 from services.cli.ingest.geotags import find_photos
 from services.cli.ingest.upload import upload_photos
 from services.cli.output import (
@@ -39,18 +37,6 @@ from shared.errors import Conflict, InvalidRequest
 from shared.geometry.colmap_model import ColmapModel, Origin, read_colmap_model
 
 MAX_NAMES_SHOWN = 5
-NAMES_MEANING = {
-    "unmatched": "names of the model are not those of exactly one photo of the map",
-    "left_out": "photos are left out, because their camera has another shape than the photo, or "
-    "EXIF mirrors it",
-}
-"""Of the names in the result of an import"""
-
-
-class ProposalAction(StrEnum):
-    LIST = "list"
-    ACCEPT = "accept"
-    UNDO = "undo"
 
 
 def reconstruct(
@@ -89,13 +75,6 @@ def reconstruct(
             help="Reconstruct all photos again, instead of adding new ones to the present model.",
         ),
     ] = False,
-    proposals: Annotated[
-        ProposalAction | None,
-        typer.Option(
-            help="List the photos whose coordinates disagree with the reconstruction, accept the "
-            "proposed coordinates, or undo that. Nothing is reconstructed.",
-        ),
-    ] = None,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
@@ -106,12 +85,10 @@ def reconstruct(
     Photos that show the same are reconstructed together and aligned to their coordinates. A later
     run adds the photos that are new. Interrupted, it goes on from its last step.
     """
-    with_import, given = images or origin, model or from_scratch
-    if (with_import and not model) or (proposals and given) or (model and from_scratch):
+    if ((images or origin) and not model) or (model and from_scratch):
         raise InvalidRequest(
             "options_contradict",
-            "--images and --origin go with --import; --from-scratch and --proposals go with no "
-            "other option.",
+            "--images and --origin go with --import; --from-scratch goes with no other option.",
         )
     place = None if origin is None else _parse_origin(origin)
     poses = read_colmap_model(model) if model else None  # fails before anything is uploaded
@@ -122,11 +99,6 @@ def reconstruct(
     with ExitStack() as stack:
         client = stack.enter_context(connect(server, map_name, key))
         progress = stack.enter_context(progress_bar())
-        if proposals is not None:
-            changed = _apply_proposals(client, proposals, progress)
-            progress.stop()
-            _print_proposals(changed, proposals, as_json)
-            return
         if images is not None:
             photos = find_photos(images, None, None, places_by_folder=False)
             print_failures(upload_photos(client, photos, progress), "refused", "failed")
@@ -137,9 +109,10 @@ def reconstruct(
         return
     _print_reconstruction(made, job.result or {})
     if made.proposals:
-        options_shown = ("reconstruct", "--proposals", "list")
-        command = client_command(*options_shown, server=server, map_name=map_name)
-        print_note(f"The coordinates of {made.proposals} photos disagree with it: {command}")
+        print_note(
+            f"The coordinates of {made.proposals} photos disagree with it. Reconstruction under "
+            "Advanced on the page proposes other ones."
+        )
 
 
 def _parse_origin(text: str) -> Origin:
@@ -190,11 +163,17 @@ def _print_reconstruction(made: Reconstruction, result: Json) -> None:
         f"{result['reconstructed']} of {result['photos']} photos are in {len(made.components)} "
         "components."
     )
-    for what, meaning in NAMES_MEANING.items():
-        if names := result.get(f"{what}_names"):
-            shown = first_names(names, MAX_NAMES_SHOWN)
-            why = meaning if made.imported else "photos are in no component"
-            print_note(f"{result[what]} {why}: {shown}")
+    if names := result.get("unmatched_names"):
+        shown = first_names(names, MAX_NAMES_SHOWN)
+        print_note(
+            f"{result['unmatched']} names of the model are not those of exactly one photo of the "
+            f"map: {shown}"
+        )
+    if left_out := result["left_out_photos"]:
+        print_note(f"{result['left_out']} photos are in no component.")
+        for reason in sorted({each["reason"] for each in left_out}):
+            names = [each["name"] for each in left_out if each["reason"] == reason]
+            print_note(f"{reason}: {first_names(names, MAX_NAMES_SHOWN)}")
 
 
 def _format_alignment(component: Component) -> str:
@@ -205,51 +184,3 @@ def _format_alignment(component: Component) -> str:
         f"{component.located} photos"
     )
     return f"{text}; on a line, turned as upright cameras are" if component.is_on_line else text
-
-
-def _apply_proposals(
-    client: Client, action: ProposalAction, progress: Progress
-) -> list[CoordinateProposal]:
-    """Accept or undo proposals; return those that were changed, or all open ones."""
-    proposals = client.coordinate_proposals(client.reconstruction().reconstruction_id)
-    chosen = [each for each in proposals if each.accepted == (action == ProposalAction.UNDO)]
-    if action != ProposalAction.LIST:
-        for each in progress.track(chosen, description="changing"):
-            undo = action == ProposalAction.UNDO
-            client.patch_photo(
-                each.image_id,
-                latitude=each.latitude if undo else each.proposed_latitude,
-                longitude=each.longitude if undo else each.proposed_longitude,
-            )
-    return chosen
-
-
-def _print_proposals(
-    proposals: list[CoordinateProposal], action: ProposalAction, as_json: bool
-) -> None:
-    if as_json:
-        print_json([each.as_json() for each in proposals])
-        return
-    if action != ProposalAction.LIST:
-        print_message(f"The coordinates of {len(proposals)} photos were changed.")
-        return
-    if not proposals:
-        print_message("No photo has coordinates that disagree with the reconstruction.")
-        return
-    table = Table(
-        "photo",
-        Column("coordinates", no_wrap=True),
-        Column("proposed", no_wrap=True),
-        Column("distance", justify="right", no_wrap=True),
-        Column("95 %", justify="right", no_wrap=True),
-    )
-    for each in proposals:
-        table.add_row(
-            escape(each.relative_path or each.original_filename),
-            f"{each.latitude:.6f}, {each.longitude:.6f}",
-            f"{each.proposed_latitude:.6f}, {each.proposed_longitude:.6f}",
-            f"{each.distance_m:.1f} m",
-            f"{each.radius_95_m:.1f} m",
-        )
-    print_table(table)
-    print_note("Nothing was changed. --proposals accept changes the coordinates in the map.")

@@ -19,7 +19,7 @@ from sqlalchemy.orm import Session
 
 from services.extractor.handlers import ExtractorContext, JobBatch
 from services.extractor.local_features import BatchFeatures
-from shared.catalog.chunks import Chunk, Descriptor, allocate_slot
+from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.generations import Generation, GenerationState, lock_generation
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import get_live_photos
@@ -76,10 +76,7 @@ def publish(
     def commit(session: Session) -> Counter[str]:
         if batch.kind == JobKind.DESCRIBE:
             return _commit_queries(session, batch, generation.id, ready, failed)
-        slot_rows = context.settings.slot_rows
-        return _commit_photos(
-            session, batch, generation.id, ready, failed, chunk_id, written, slot_rows
-        )
+        return _commit_photos(session, batch, generation.id, ready, failed, chunk_id, written)
 
     batch.outcomes.update(context.catalog.run(commit))
     batch.reasons.update(error.code for _, error in failed)
@@ -106,7 +103,6 @@ def _commit_photos(
     failed: Failures,
     chunk_id: UUID,
     written: WrittenChunk | None,
-    slot_rows: int,
 ) -> Counter[str]:
     """Register the chunk and end the jobs; return the number of jobs by outcome."""
     lock_map(session, batch.jobs[0].map_id)
@@ -142,9 +138,8 @@ def _commit_photos(
         succeed_job(leased, {"file_id": file_id, "generation_id": str(generation_id)})
         outcomes["succeeded"] += 1
     if new_rows and written is not None:
-        slot = allocate_slot(generation, written.rows, slot_rows)
         place = {"generation_id": generation_id, "chunk_id": chunk_id}
-        session.add(Chunk(id=chunk_id, generation_id=generation_id, slot=slot, **asdict(written)))
+        session.add(Chunk(id=chunk_id, generation_id=generation_id, **asdict(written)))
         session.flush()
         session.execute(insert(Descriptor), [place | columns for columns in new_rows])
         increment_map_version(session, generation.map_id)

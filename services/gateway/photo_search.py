@@ -25,7 +25,6 @@ from shared.catalog.database.base import (
     json_array_has_part,
 )
 from shared.catalog.photos import Photo, PhotoRole, has_given_place, is_geotagged, is_removed
-from shared.geodesy import latitude_bounds, longitude_half_width
 from shared.place_paths import PATH_SEPARATOR
 from shared.search_api.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
 
@@ -162,23 +161,14 @@ def search_photos(
 
 
 def _circle_conditions(circle: Circle, photo: type[Photo]) -> list[Condition]:
-    south, north = latitude_bounds(circle.latitude, circle.radius_m)
+    # The bounding box can use the index; the distance is exact.
+    box = circle.bounding_box()
     distance = db_distance_m(
         literal(circle.latitude), literal(circle.longitude), photo.latitude, photo.longitude
     )
-    conditions = [photo.latitude.between(south, north), distance <= circle.radius_m]
-    half_width = longitude_half_width(circle.latitude, circle.radius_m)
-    if half_width is None or half_width >= 180:
-        return conditions
-    # The bounding box can use the index; the distance is exact.
-    west, east = circle.longitude - half_width, circle.longitude + half_width
-    bounding_box = Box(
-        south=south,
-        west=west + 360 if west < -180 else west,
-        north=north,
-        east=east - 360 if east > 180 else east,
-    )
-    conditions.append(or_(*_longitude_conditions(bounding_box, photo)))
+    conditions = [photo.latitude.between(box.south, box.north), distance <= circle.radius_m]
+    if (box.west, box.east) != (-180.0, 180.0):
+        conditions.append(or_(*_longitude_conditions(box, photo)))
     return conditions
 
 

@@ -34,9 +34,8 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map
 from shared.catalog.photos import PhotoFilterValues, list_photos_changed_since
-from shared.config.shards import SINGLE_SHARD, Shard
 from shared.errors import NotFound, Unavailable
-from shared.search_api.protocol import IndexPart, ReplicationLag
+from shared.search_api.protocol import ReplicationLag
 from shared.storage import ObjectStore
 from shared.storage.chunks import CODED_DIMENSION
 from shared.storage.read_retries import ReadRetries
@@ -78,9 +77,8 @@ def sync_snapshot(
     generation_id: UUID,
     old: Snapshot | None,
     unreadable: ReadRetries,
-    shard: Shard = SINGLE_SHARD,
 ) -> Snapshot | None:
-    """Build the snapshot of the shard's part of a generation, reusing the chunks of `old`.
+    """Build the snapshot of a generation, reusing the chunks of `old`.
 
     The catalog is read in one consistent transaction. A chunk that can't be read, or whose hash
     differs, is named in `missing` and read again once `unreadable` says so; the others are served.
@@ -96,7 +94,7 @@ def sync_snapshot(
             memory_budget.release_generation(generation_id)
             return None
         version = session.get_one(Map, generation.map_id).version
-        chunks = [c for c in list_live_chunks(session, generation_id) if shard.owns(c.slot)]
+        chunks = list_live_chunks(session, generation_id)
         known = {c.chunk_id: c for c in old.chunks if not c.was_changed()} if old else {}
         changed = list_photos_changed_since(session, generation.map_id, old.version) if old else []
         filter_values = {
@@ -145,17 +143,13 @@ def sync_snapshot(
 
 def _apply_memory_budget(memory_budget: MemoryBudget, snapshot: Snapshot) -> Snapshot:
     """Return the snapshot with as many parts in memory as the budget allows."""
-    parts = memory_parts(snapshot.chunks)
-    resident_parts = memory_budget.allocate(
-        snapshot.generation_id, [size_bytes for _, size_bytes in parts]
-    )
+    sizes = memory_parts(snapshot.chunks)
+    resident_parts = memory_budget.allocate(snapshot.generation_id, sizes)
     return replace(
         snapshot,
         chunks=tuple(hold_in_memory(chunk, resident_parts) for chunk in snapshot.chunks),
-        parts=tuple(
-            IndexPart(name=name, size_bytes=size_bytes, resident=number < resident_parts)
-            for number, (name, size_bytes) in enumerate(parts)
-        ),
+        resident_bytes=sum(sizes[:resident_parts]),
+        mapped_bytes=sum(sizes[resident_parts:]),
     )
 
 

@@ -295,15 +295,10 @@ def hold_in_memory(chunk: LoadedChunk, parts: int) -> LoadedChunk:
     return replace(chunk, rows=rows, codes=codes)
 
 
-def memory_parts(chunks: Sequence[LoadedChunk]) -> list[tuple[str, int]]:
-    """Return the index parts of the chunks, with their total sizes in bytes."""
-    sizes: dict[str, int] = {}
-    for chunk in chunks:
-        levels = chunk.codes.levels if chunk.codes else ()
-        for number, level in enumerate(levels):
-            name = f"codes {number}"
-            sizes[name] = sizes.get(name, 0) + level.nbytes
-    return [*sizes.items(), ("rows", sum(chunk.rows.nbytes for chunk in chunks))]
+def memory_parts(chunks: Sequence[LoadedChunk]) -> list[int]:
+    """Return the total sizes of the chunks' index parts in bytes: levels of codes, then rows."""
+    levels = [[level.nbytes for level in chunk.codes.levels] for chunk in chunks if chunk.codes]
+    return [*map(sum, zip(*levels, strict=True)), sum(chunk.rows.nbytes for chunk in chunks)]
 
 
 def _in_memory(stored: NDArray[Any], loaded: NDArray[Any], resident: bool) -> NDArray[Any]:

@@ -114,7 +114,7 @@ class _Query:
 
     def rank_photos(self, scored: _ScoredRows) -> list[SearchHit]:
         """Return the hits, sorted by descending score, ties by photo id."""
-        options, rows, scores = self.options, scored.rows, _round_scores(scored.scores)
+        options, rows, scores = self.options, scored.rows, round_scores(scored.scores)
         if len(rows) > options.k:
             kth = np.partition(scores, len(scores) - options.k)[len(scores) - options.k]
             best = scores >= kth
@@ -162,6 +162,7 @@ class _Query:
         return int(np.count_nonzero(self.row_mask))
 
 
-def _round_scores(scores: Scores) -> Scores:
+def round_scores(scores: Scores) -> Scores:
+    """Round cosines, so that those of equal rows are equal."""
     # Clipped, because a computed cosine may exceed 1 slightly.
     return scores.round(SCORE_DECIMALS).clip(-1.0, 1.0)

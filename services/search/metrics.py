@@ -27,7 +27,7 @@ from shared.search_api.protocol import (
 from shared.telemetry.tracing import span
 
 METRIC_PREFIX = "placewise_search"
-# Seconds, from a small map in memory to a dense scan of a full shard, and the longest wait for a
+# Seconds, from a small map in memory to a dense scan of a full worker, and the longest wait for a
 # version.
 LATENCY_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 
@@ -47,12 +47,21 @@ class MeteredSearch:
         self._registry = registry or CollectorRegistry()
         counter = partial(Counter, namespace=METRIC_PREFIX, registry=self._registry)
         histogram = partial(Histogram, namespace=METRIC_PREFIX, registry=self._registry)
-        self._searches = counter(
-            "searches", "Searches by outcome: answered, or the error code.", ["outcome"]
-        )
-        self._seconds = histogram(
-            "seconds", "Duration of successful searches in seconds.", buckets=LATENCY_BUCKETS
-        )
+        self._requests = {
+            name: (
+                counter(name, f"{what} by outcome: answered, or the error code.", ["outcome"]),
+                histogram(
+                    seconds,
+                    f"Duration of successful {what.lower()} in seconds.",
+                    buckets=LATENCY_BUCKETS,
+                ),
+            )
+            for name, seconds, what in (
+                ("searches", "seconds", "Searches"),
+                ("matches", "match_seconds", "Match requests"),
+                ("poses", "pose_seconds", "Pose requests"),
+            )
+        }
         self._rows = counter("rows_scanned", "Descriptor rows compared with a query.")
         self._reranked = counter(
             "rows_reranked", "Descriptor rows compared exactly, by their full descriptors."
@@ -63,24 +72,8 @@ class MeteredSearch:
             "Largest error of a response's sign-code estimates, in standard deviations.",
             buckets=MAX_Z_BUCKETS,
         )
-        self._matches = counter(
-            "matches", "Match requests by outcome: answered, or the error code.", ["outcome"]
-        )
-        self._match_seconds = histogram(
-            "match_seconds",
-            "Duration of successful match requests in seconds.",
-            buckets=LATENCY_BUCKETS,
-        )
         self._matched_photos = counter(
             "matched_photos", "Photos by outcome: matched or without_features.", ["outcome"]
-        )
-        self._poses = counter(
-            "poses", "Pose requests by outcome: answered, or the error code.", ["outcome"]
-        )
-        self._pose_seconds = histogram(
-            "pose_seconds",
-            "Duration of successful pose requests in seconds.",
-            buckets=LATENCY_BUCKETS,
         )
         self._pose_answers = counter(
             "pose_answers", "Answered pose requests by outcome: found or no_pose.", ["outcome"]
@@ -89,10 +82,7 @@ class MeteredSearch:
 
     def search(self, request: SearchRequest) -> SearchResponse:
         """Search and record the metrics of the response."""
-        with (
-            _measured(self._searches, self._seconds),
-            span("search", shard=str(self._worker.shard), k=request.k),
-        ):
+        with self._measured("searches"), span("search", k=request.k):
             response = self._worker.search(request)
         self._rows.inc(response.rows_scanned)
         self._reranked.inc(response.rows_reranked)
@@ -103,10 +93,7 @@ class MeteredSearch:
 
     def match(self, request: MatchRequest) -> MatchResponse:
         """Match and record the metrics of the response."""
-        with (
-            _measured(self._matches, self._match_seconds),
-            span("match", photos=len(request.candidates)),
-        ):
+        with self._measured("matches"), span("match", photos=len(request.candidates)):
             response = self._worker.match(request)
         matched = sum(each is not None for each in response.candidates)
         self._matched_photos.labels("matched").inc(matched)
@@ -115,10 +102,7 @@ class MeteredSearch:
 
     def estimate_pose(self, request: PoseRequest) -> PoseResponse:
         """Compute a pose and record whether there is one."""
-        with (
-            _measured(self._poses, self._pose_seconds),
-            span("pose", photos=len(request.candidates)),
-        ):
+        with self._measured("poses"), span("pose", photos=len(request.candidates)):
             response = self._worker.estimate_pose(request)
         self._pose_answers.labels("no_pose" if response.pose is None else "found").inc()
         return response
@@ -130,18 +114,18 @@ class MeteredSearch:
         """Render the metrics in Prometheus' text format."""
         return generate_latest(self._registry)
 
-
-@contextlib.contextmanager
-def _measured(requests: Counter, seconds: Histogram) -> Iterator[None]:
-    """Count the request of the block by its outcome, and observe its duration if it succeeds."""
-    started = time.perf_counter()
-    try:
-        yield
-    except PlacewiseError as error:
-        requests.labels(error.code).inc()
-        raise
-    requests.labels("answered").inc()
-    seconds.observe(time.perf_counter() - started)
+    @contextlib.contextmanager
+    def _measured(self, kind: str) -> Iterator[None]:
+        """Count the request of the block by its outcome, and observe its duration on success."""
+        requests, seconds = self._requests[kind]
+        started = time.perf_counter()
+        try:
+            yield
+        except PlacewiseError as error:
+            requests.labels(error.code).inc()
+            raise
+        requests.labels("answered").inc()
+        seconds.observe(time.perf_counter() - started)
 
 
 class _SnapshotCollector(Collector):
@@ -157,6 +141,7 @@ class _SnapshotCollector(Collector):
             ("mapped_bytes", "Bytes of descriptors on disk.", status.mapped_bytes),
             ("rows", "Searchable rows.", status.rows),
             ("missing_chunks", "Unreadable chunks.", len(status.missing)),
+            ("unwritten_chunks", "Chunks still to be written to Milvus.", status.unwritten),
         ):
             yield GaugeMetricFamily(f"{METRIC_PREFIX}_{name}", text, value)
         scans = "First-level scans of the sign codes."
@@ -167,16 +152,13 @@ class _SnapshotCollector(Collector):
         )
         lags = status.lags.items()
         of_generations: tuple[tuple[str, str, Mapping[UUID, float]], ...] = (
+            ("recall", "Measured recall of an approximate index.", status.recalls),
             ("version", "Version of the map in the snapshot.", status.versions),
-            (
-                "lag_versions",
-                "Versions behind the map.",
-                {key: lag.versions for key, lag in lags},
-            ),
+            ("lag_versions", "Versions behind the map.", {k: lag.versions for k, lag in lags}),
             (
                 "lag_seconds",
                 "Seconds since the snapshot was last known to be current.",
-                {key: lag.seconds for key, lag in lags},
+                {k: lag.seconds for k, lag in lags},
             ),
         )
         for name, text, values in of_generations:

@@ -59,7 +59,6 @@ class Readiness(BaseModel):
     """
 
     status: str
-    shard: str
     reasons: list[str]
     lags: dict[UUID, ReplicationLag]
     missing: list[str]
@@ -69,8 +68,7 @@ def create_search_app(worker: SearchWorker, registry: CollectorRegistry | None =
     """Create the HTTP API of a worker, which the caller keeps in sync with the catalog."""
     app = FastAPI(
         title="Placewise search",
-        description=f"Exact cosine top-k on shard {worker.shard} of every map, matches of local "
-        "features, and poses.",
+        description="Cosine top-k on every map, matches of local features, and poses.",
         responses=PROBLEM_RESPONSES,
     )
     install_exception_handlers(app)
@@ -79,13 +77,13 @@ def create_search_app(worker: SearchWorker, registry: CollectorRegistry | None =
 
     @app.post("/search", operation_id="search", response_model=SearchResponse)
     def search(request: SearchRequest) -> Response:
-        """Search this shard for the rows that are most similar to the referenced one."""
+        """Search for the rows that are most similar to the referenced one."""
         # Serialised here, because FastAPI would validate the response again.
         return Response(metrics.search(request).model_dump_json(), media_type="application/json")
 
     @app.post("/match", operation_id="match", response_model=MatchResponse)
     def match(request: MatchRequest) -> Response:
-        """Match the local features of a query with those of photos of any shard."""
+        """Match the local features of a query with those of photos."""
         return Response(metrics.match(request).model_dump_json(), media_type="application/json")
 
     @app.post("/pose", operation_id="estimate_pose", response_model=PoseResponse)
@@ -139,8 +137,7 @@ def _check_readiness(worker: SearchWorker) -> Readiness:
                 f"last current {lag.seconds:.1f} s ago"
             )
     return Readiness(
-        status="not ready" if reasons else "degraded" if status.missing else "ready",
-        shard=status.shard,
+        status="not ready" if reasons else "degraded" if status.incomplete else "ready",
         reasons=reasons,
         lags=status.lags,
         missing=list(status.missing),
@@ -157,14 +154,11 @@ class WorkerHeartbeat:
     It runs in a thread of its own, because loading may take minutes while the worker is alive.
     """
 
-    def __init__(
-        self, catalog: Catalog, worker: SearchWorker, name: str, url: str | None = None
-    ) -> None:
+    def __init__(self, catalog: Catalog, worker: SearchWorker, name: str) -> None:
         self.id = new_id()
         self._catalog = catalog
         self._worker = worker
         self._name = name
-        self._url = url
         self._sent_versions: tuple[Mapping[UUID, int], Sequence[str]] | None = None
         self._sent_at = 0.0
 
@@ -191,14 +185,12 @@ class WorkerHeartbeat:
         if versions == self._sent_versions and time.monotonic() - self._sent_at < HEARTBEAT_SECONDS:
             return
         with self._catalog.write(is_heartbeat=versions == self._sent_versions) as session:
-            upsert_search_worker(
-                session, self.id, self._name, self._url, self._worker.shard, *versions
-            )
+            upsert_search_worker(session, self.id, self._name, *versions)
         self._sent_versions, self._sent_at = versions, time.monotonic()
 
 
 def serve_search(settings: Settings, announce: Announce) -> None:
-    """Serve searches in the shard SEARCH_SHARD on HOST and PORT until SIGTERM.
+    """Serve searches on HOST and PORT until SIGTERM.
 
     Raises:
         Misconfigured: `address_in_use`; also as `service_process` raises it.
@@ -209,9 +201,9 @@ def serve_search(settings: Settings, announce: Announce) -> None:
         with listen(settings.host, settings.port) as listener:
             host, port = listener.getsockname()[:2]
             registry = CollectorRegistry()
-            worker = SearchWorker(catalog, store, settings, settings.shard)
+            worker = SearchWorker.from_settings(catalog, store, settings)
             url = reachable_url(host, port)
-            heartbeat = WorkerHeartbeat(catalog, worker, f"{socket.gethostname()}:{port}", url)
+            heartbeat = WorkerHeartbeat(catalog, worker, f"{socket.gethostname()}:{port}")
             # Its clients are a few gateways, with one connection for each concurrent query.
             limits = replace(ConnectionLimits.of(settings), per_address=0)
             server = http_server(create_search_app(worker, registry), Connections(limits))
@@ -226,7 +218,7 @@ def serve_search(settings: Settings, announce: Announce) -> None:
             try:
                 with serve_metrics(settings, registry), stop_on_signals(server):
                     announce(
-                        f"Placewise search serves shard {settings.shard} on {url}\n"
+                        f"Placewise search listens on {url}\n"
                         f"  health:   {url}/readyz   {url}/metrics"
                     )
                     server.run(sockets=[listener])

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from services.search.chunk_loader import LoadedChunk
 from services.search.photo_columns import JoinedColumns
-from shared.search_api.protocol import IndexPart, LoadedGeneration
 
 if TYPE_CHECKING:  # imports numba, which takes a while to load; small maps need no codes
     from services.search.exact_rerank import RowBlocks
@@ -24,7 +23,7 @@ if TYPE_CHECKING:  # imports numba, which takes a while to load; small maps need
 class Snapshot:
     """The loaded chunks of a generation at `version` of its map.
 
-    `missing` names objects that can't be read.
+    `missing` names objects that can't be read, `unwritten` those that an engine lacks.
     """
 
     generation_id: UUID
@@ -32,10 +31,12 @@ class Snapshot:
     version: int
     chunks: tuple[LoadedChunk, ...]
     missing: tuple[str, ...] = ()
+    unwritten: frozenset[str] = frozenset()
     disk_full: bool = False
     """Whether some are missing only because the disk of the worker's cache is full."""
-    parts: tuple[IndexPart, ...] = ()
-    """Parts of the index, and whether they are resident or mapped files."""
+    resident_bytes: int = 0
+    mapped_bytes: int = 0
+    """Bytes of its index in memory, and in mapped files."""
 
     @cached_property
     def by_key(self) -> Mapping[str, LoadedChunk]:
@@ -56,11 +57,6 @@ class Snapshot:
     def dimension(self) -> int:
         """Dimension of the rows; 0 without any rows."""
         return self.chunks[0].rows.shape[1] if self.chunks else 0
-
-    @cached_property
-    def held(self) -> LoadedGeneration:
-        """The loaded generation as `SearchStatus` reports it."""
-        return LoadedGeneration(rows=len(self.photos), dimension=self.dimension, parts=self.parts)
 
     @cached_property
     def has_sign_codes(self) -> bool:

@@ -1,9 +1,9 @@
 """Search worker: `SearchBackend` in process, on snapshots that are swapped atomically.
 
 `SearchWorker` keeps a snapshot of each generation in sync with the catalog and runs queries on the
-current one. `QueryRowReader` reads the row that a query refers to, which may lie in a chunk of
-another shard, in a chunk that has been merged since, or under `queries/`. It caches stored rows:
-the gateway asks for more hits of the same query, and evaluations use the same photos again.
+current one. `QueryRowReader` reads the row that a query refers to, which may lie in a chunk that
+has been merged since, or under `queries/`. It caches stored rows: the gateway asks for more hits of
+the same query, and evaluations use the same photos again.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Collection, Sequence
 from concurrent import futures
+from typing import Any
 from uuid import UUID
 
 import numpy as np
@@ -37,8 +38,7 @@ from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.session import Catalog, ChangePoll
 from shared.catalog.generations import GenerationState
 from shared.config.settings import Settings
-from shared.config.shards import SINGLE_SHARD, Shard
-from shared.errors import Gone, NotFound, Unavailable
+from shared.errors import Gone, Misconfigured, NotFound, Unavailable
 from shared.search_api.background import subtract_background
 from shared.search_api.protocol import (
     MatchRequest,
@@ -148,7 +148,7 @@ def _unreadable_error(object_key: str) -> Unavailable:
     )
 
 
-MAX_WAIT_SECONDS = 5.0  # for `min_version`; half of the time that the gateway gives a shard
+MAX_WAIT_SECONDS = 5.0  # for `min_version`; half of the time that the gateway gives a search
 FOLLOW_SECONDS = 1.0  # interval of the polls for changes of the catalog
 VERSION_POLL_SECONDS = 0.01
 LOAD_THREADS = 4  # one may take minutes for a generation that is being built
@@ -156,7 +156,7 @@ FILE_CHECK_SECONDS = 5.0  # interval of the checks whether mapped files were cha
 
 
 class SearchWorker:
-    """Holds one snapshot of its shard for each generation; `search` is thread-safe.
+    """Holds one snapshot of each generation; `search` is thread-safe.
 
     A query uses the current snapshot. Only if that is older than `min_version` does it wait, at
     most `max_wait_seconds`, for the thread that loads the newer one. Loading one generation never
@@ -168,17 +168,15 @@ class SearchWorker:
         catalog: Catalog,
         store: ObjectStore,
         settings: Settings,
-        shard: Shard = SINGLE_SHARD,
         *,
         max_wait_seconds: float = MAX_WAIT_SECONDS,
     ) -> None:
         """Create a worker without any snapshot."""
-        self.shard = shard
         self.replication_lag = ReplicationLagTracker()
         self._catalog = catalog
         self._max_wait_seconds = max_wait_seconds
         self._store = store
-        self._folder = settings.search_cache_folder(shard)
+        self._folder = settings.search_cache_folder
         self.query_batcher = QueryBatcher()
         self._memory_budget = MemoryBudget(settings.search_memory_bytes)
         self._query_rows = QueryRowReader(store)
@@ -190,6 +188,20 @@ class SearchWorker:
         self._load_threads = futures.ThreadPoolExecutor(LOAD_THREADS, "search-load")
         self._unreadable = ReadRetries()
         self._files_due: dict[UUID, float] = {}  # next check of each generation's files
+
+    @classmethod
+    def from_settings(
+        cls, catalog: Catalog, store: ObjectStore, settings: Settings
+    ) -> SearchWorker:
+        """Create the worker of SEARCH_ENGINE."""
+        if settings.search_engine == "milvus":
+            try:
+                from services.search.milvus import MilvusWorker
+            except ImportError as error:
+                detail = "SEARCH_ENGINE=milvus needs the extra milvus: pip install pymilvus."
+                raise Misconfigured("no_milvus", detail) from error
+            return MilvusWorker(catalog, store, settings)
+        return cls(catalog, store, settings)
 
     def run(self, stop: threading.Event) -> None:
         """Sync active generations until `stop` is set."""
@@ -221,7 +233,7 @@ class SearchWorker:
         """Sync every generation of these states to its map's version; drop deleted generations."""
         read_at = time.monotonic()
         # Before the catalog is read: what another thread loads meanwhile has not ended.
-        held, folders = self._snapshots.keys(), list_generation_folders(self._folder)
+        held, stored = self._snapshots.keys(), self._list_stored()
         current = read_generation_versions(self._catalog)
         self.replication_lag.record_catalog_read(current, read_at)
         for generation_id, target in current.items():
@@ -242,43 +254,39 @@ class SearchWorker:
             self._snapshots = {k: v for k, v in self._snapshots.items() if k not in ended}
             known = {*current, *self._snapshots, *self._loads}
             self._files_due = {k: v for k, v in self._files_due.items() if k in known}
-        remove_stale_folders(folders, known)
+        self._remove_stored(stored, known)
         self._unreadable.forget_others(
             {key for snapshot in self._snapshots.values() for key in snapshot.missing}
         )
 
     def search(self, request: SearchRequest) -> SearchResponse:
-        """Return the most similar rows of this shard; see `SearchRequest`."""
+        """Return the most similar rows; see `SearchRequest`."""
         snapshot = self.snapshot(request.generation_id, request.min_version)
         query = self._query_rows.read_query(snapshot, request)
         if request.background:
             background = self._query_rows.read_background(request.background)
             query = subtract_background(query, background)
-        row_mask = build_row_mask(snapshot.photos, request.photos, request.exclude)
-        options = SearchOptions(request.k, request.mode)
-        return execute_query(snapshot, query, row_mask, options, self.query_batcher)
+        return self._find_rows(snapshot, query, request)
 
     def match(self, request: MatchRequest) -> MatchResponse:
-        """Match local features, of photos of any shard; see `MatchRequest`."""
+        """Match local features; see `MatchRequest`."""
         return self._photo_matcher.match(request)
 
     def estimate_pose(self, request: PoseRequest) -> PoseResponse:
-        """Compute a pose, with photos of any shard; see `PoseRequest`."""
+        """Compute a pose; see `PoseRequest`."""
         return self._pose_estimator.estimate(request)
 
     def status(self) -> SearchStatus:
         """Return what is loaded, with sizes and lags."""
         snapshots = self._snapshots
         versions = {key: snapshot.version for key, snapshot in snapshots.items()}
-        parts = [part for snapshot in snapshots.values() for part in snapshot.parts]
         return SearchStatus(
-            shard=str(self.shard),
             rows=sum(snapshot.live_rows for snapshot in snapshots.values()),
-            resident_bytes=sum(part.size_bytes for part in parts if part.resident),
-            mapped_bytes=sum(part.size_bytes for part in parts if not part.resident),
-            held={key: snapshot.held for key, snapshot in snapshots.items()},
+            resident_bytes=sum(snapshot.resident_bytes for snapshot in snapshots.values()),
+            mapped_bytes=sum(snapshot.mapped_bytes for snapshot in snapshots.values()),
             versions=versions,
-            incomplete=tuple(key for key, snapshot in snapshots.items() if snapshot.missing),
+            incomplete=tuple(k for k, one in snapshots.items() if one.missing or one.unwritten),
+            unwritten=sum(len(snapshot.unwritten) for snapshot in snapshots.values()),
             missing=tuple(key for snapshot in snapshots.values() for key in snapshot.missing),
             disk_full=any(snapshot.disk_full for snapshot in snapshots.values()),
             lags=self.replication_lag.current_lags(versions),
@@ -327,22 +335,41 @@ class SearchWorker:
         """Load a generation in a thread of its own, and serve the new snapshot."""
         new = None
         try:
-            new = sync_snapshot(
-                self._catalog,
-                self._store,
-                self._folder,
-                self._memory_budget,
-                generation_id,
-                self._snapshots.get(generation_id),
-                self._unreadable,
-                self.shard,
-            )
+            new = self._sync_generation(generation_id, self._snapshots.get(generation_id))
             return new
         finally:
             with self._lock:
                 if new is not None:
                     self._snapshots = {**self._snapshots, generation_id: new}
                 del self._loads[generation_id]
+
+    # What follows depends on where the rows are; `MilvusWorker` has its own.
+
+    def _sync_generation(self, generation_id: UUID, old: Snapshot | None) -> Snapshot | None:
+        """Bring a snapshot up to date; None if the generation no longer exists."""
+        return sync_snapshot(
+            self._catalog,
+            self._store,
+            self._folder,
+            self._memory_budget,
+            generation_id,
+            old,
+            self._unreadable,
+        )
+
+    def _find_rows(self, snapshot: Snapshot, query: Row, request: SearchRequest) -> SearchResponse:
+        """Return the rows that are most similar to a query, (dimension,) float32."""
+        row_mask = build_row_mask(snapshot.photos, request.photos, request.exclude)
+        options = SearchOptions(request.k, request.mode)
+        return execute_query(snapshot, query, row_mask, options, self.query_batcher)
+
+    def _list_stored(self) -> list[Any]:
+        """List what is stored of any generation outside of this process."""
+        return list_generation_folders(self._folder)
+
+    def _remove_stored(self, stored: list[Any], known: Collection[UUID]) -> None:
+        """Remove what of this is of generations other than the known ones."""
+        remove_stale_folders(stored, known)
 
     def _needs_reload(self, snapshot: Snapshot) -> bool:
         """Whether a missing chunk is due for a retry, or a mapped file was changed."""

@@ -22,7 +22,6 @@ from shared.catalog.chunks import Descriptor, find_descriptor, find_feature_rows
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.photos import Photo, PhotoRole, has_given_place, is_geotagged
-from shared.config.shards import is_shard_name
 from shared.errors import Conflict, Gone, Unavailable
 from shared.evaluation.places.evidence import PhotoLocation, match_support
 from shared.evaluation.places.levels import CandidateLevel
@@ -229,7 +228,7 @@ class EvaluationSearch:
 
         Raises:
             Conflict: `map_damaged`: a chunk can't be read.
-            Unavailable: `search_incomplete`: a shard did not answer.
+            Unavailable: `search_incomplete`: rows are still to be written to the engine.
         """
         for attempt in range(1, MAX_READ_ATTEMPTS + 1):
             with self.catalog.read() as session:
@@ -256,10 +255,10 @@ class EvaluationSearch:
                 if error.code == "chunk_unreadable":
                     raise map_damaged_error([chunk.object_key]) from error
                 raise
-            if any(is_shard_name(part) for part in answer.missing):
+            if answer.filling:
                 raise Unavailable(
                     "search_incomplete",
-                    f"Shards {', '.join(answer.missing)} did not answer: the results would cover "
+                    "Rows are still being written to the search engine: the results would cover "
                     "only a part of the map.",
                 )
             if answer.missing:

@@ -41,7 +41,7 @@ class StewardMetrics:
             "leases_expired", "Jobs whose lease expired because their worker died."
         )
         self.wakeups_resent = counter("wakeups_resent", "Wakeups sent again for waiting jobs.")
-        self.slots_merged = counter("slots_merged", "Slots whose chunks were merged into one.")
+        self.compactions = counter("compactions", "Chunks that were merged into one, or rewritten.")
         self.journal_lines = counter("journal_lines", "Catalog rows written to the journal.")
         self.objects_deleted = counter(
             "objects_deleted", "Deleted objects that nothing referred to any more.", ["task"]

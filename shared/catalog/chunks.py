@@ -1,7 +1,7 @@
 """Chunks and descriptors: which row of which chunk file is the descriptor of a photo.
 
-A chunk object is immutable. Compaction writes a new chunk in the same slot and supersedes the old
-ones. A row that no descriptor refers to is dead; the next compaction drops it.
+A chunk object is immutable. Compaction writes a new chunk and supersedes the old ones. A row that
+no descriptor refers to is dead; the next compaction drops it.
 """
 
 from __future__ import annotations
@@ -40,7 +40,6 @@ class Chunk(Base):
     generation_id: Mapped[UUID] = mapped_column(
         sa.Uuid, sa.ForeignKey("generations.id"), index=True
     )
-    slot: Mapped[int] = mapped_column(sa.Integer)
     object_key: Mapped[str] = mapped_column(sa.Text, unique=True)
     rows: Mapped[int] = mapped_column(sa.Integer)
     size_bytes: Mapped[int] = mapped_column(sa.BigInteger)
@@ -55,7 +54,7 @@ class Chunk(Base):
     superseded_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
     __table_args__ = (
-        partial_index("ix_chunks_live", "generation_id", "slot", only=superseded_at.is_(None)),
+        partial_index("ix_chunks_live", "generation_id", only=superseded_at.is_(None)),
         partial_index("ix_chunks_superseded", "superseded_at", only=superseded_at.is_not(None)),
     )
 
@@ -177,12 +176,12 @@ def find_feature_rows(
 
 
 def list_live_chunks(session: Session, generation_id: UUID) -> list[Chunk]:
-    """List the chunks of the generation that are not superseded, by slot."""
+    """List the chunks of the generation that are not superseded, oldest first."""
     return list(
         session.scalars(
             sa.select(Chunk)
             .where(Chunk.generation_id == generation_id, Chunk.superseded_at.is_(None))
-            .order_by(Chunk.slot, Chunk.id)
+            .order_by(Chunk.id)
         )
     )
 
@@ -193,7 +192,7 @@ def list_live_rows(session: Session, chunk_id: UUID) -> list[tuple[int, UUID]]:
 
 
 def delete_chunk_rows(session: Session, chunk_id: UUID) -> None:
-    """Delete the chunk's row and its descriptors, of which there are up to SLOT_ROWS."""
+    """Delete the chunk's row and its descriptors, of which there are up to CHUNK_ROWS."""
     session.execute(sa.delete(Descriptor).where(Descriptor.chunk_id == chunk_id))
     session.execute(sa.delete(Chunk).where(Chunk.id == chunk_id))
 
@@ -227,6 +226,16 @@ def estimate_described(session: Session, generation_id: UUID) -> int:
     )
     if rows and rows > MAX_EXACT_COUNT:
         return int(rows)
+    return count_rows(session, _select_described(generation_id))
+
+
+def list_described(session: Session, generation_id: UUID) -> set[UUID]:
+    """Return the live photos with a descriptor in the generation."""
+    return set(session.scalars(_select_described(generation_id)))
+
+
+def count_described(session: Session, generation_id: UUID) -> int:
+    """Count the live photos with a descriptor in the generation."""
     return count_rows(session, _select_described(generation_id))
 
 
@@ -273,16 +282,3 @@ def _select_described(generation_id: UUID, role: PhotoRole | None = None) -> sa.
         .where(Descriptor.generation_id == generation_id, Photo.deleted_at.is_(None))
     )
     return statement if role is None else statement.where(Photo.role == role)
-
-
-def allocate_slot(generation: Generation, rows: int, slot_rows: int) -> int:
-    """Return the slot for a new chunk of `rows` rows, and open a new slot when it is full.
-
-    A slot has at most `slot_rows` rows, unless a single chunk has more. The caller holds the
-    generation's lock.
-    """
-    if generation.open_slot_rows and generation.open_slot_rows + rows > slot_rows:
-        generation.open_slot += 1
-        generation.open_slot_rows = 0
-    generation.open_slot_rows += rows
-    return generation.open_slot

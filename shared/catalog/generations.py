@@ -32,8 +32,7 @@ from shared.ids import new_id
 class Generation(Journaled, Base):
     """A generation. `spec` has everything that determines a descriptor's value.
 
-    `calibration` is a `shared.evaluation.places.PlaceModel`, fitted by evaluations. New
-    chunks go into `open_slot`, which has `open_slot_rows` rows so far.
+    `calibration` is a `shared.evaluation.places.PlaceModel`, fitted by evaluations.
     """
 
     __tablename__ = "generations"
@@ -57,8 +56,6 @@ class Generation(Journaled, Base):
     calibration: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
     uses_matches: Mapped[bool | None] = mapped_column(Boolean)
     """Whether local features improve its answers; null until an evaluation has decided it."""
-    open_slot: Mapped[int] = mapped_column(Integer, default=0)
-    open_slot_rows: Mapped[int] = mapped_column(Integer, default=0)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     activated_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     ended_at: Mapped[datetime | None] = mapped_column(UtcDateTime)

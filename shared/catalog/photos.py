@@ -27,11 +27,13 @@ from shared.catalog.database.base import (
     db_now,
     db_now_plus,
     filename_trigrams,
+    json_array_has_part,
     partial_index,
 )
 from shared.enums import PhotoRole as PhotoRole
 from shared.errors import Gone, NotFound
 from shared.ids import new_id
+from shared.search_api.photo_filter import is_part_of_tag
 
 
 class Photo(Journaled, Base):
@@ -230,6 +232,17 @@ def list_photos_changed_since(
         )
     )
     return [PhotoFilterValues(*row) for row in rows]
+
+
+def list_tags_with(session: Session, map_id: UUID, part: str) -> list[str]:
+    """List the tags of the map's live photos of which `part` is a part, in either case."""
+    lists = session.scalars(
+        sa.select(Photo.tags)
+        .where(Photo.map_id == map_id, Photo.deleted_at.is_(None))
+        .where(json_array_has_part(Photo.tags, part))
+        .distinct()
+    )
+    return sorted({tag for tags in lists for tag in tags if is_part_of_tag(part, tag)})
 
 
 def select_live_photos(map_id: UUID, role: PhotoRole | None = None) -> sa.Select[UUID]:

@@ -3,9 +3,9 @@
 The registry of gateways, extractors and stewards is informational, for `GET /health` and operators;
 leases decide which worker owns a job.
 
-Search workers have a registry of their own with their shard and the versions that they have
-loaded, updated about every second or two. A generation is activated only once every live worker has
-registered it as loaded.
+Search workers have a registry of their own with the versions that they have loaded, updated about
+every second or two. A generation is activated only once every live worker has registered it as
+loaded.
 """
 
 from __future__ import annotations
@@ -23,11 +23,10 @@ from importlib.metadata import version
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import Integer, String, Text, Uuid, and_, delete, or_, select, update
+from sqlalchemy import String, Uuid, and_, delete, or_, select, update
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.chunks import Chunk
 from shared.catalog.database.base import (
     Base,
     JsonValue,
@@ -38,7 +37,6 @@ from shared.catalog.database.base import (
 )
 from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.session import Catalog
-from shared.config.shards import Shard
 from shared.ids import new_id
 
 log = logging.getLogger(__name__)
@@ -191,11 +189,7 @@ class RegisteredSearchWorker(Base):
 
     id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     name: Mapped[str] = mapped_column(String(200))
-    url: Mapped[str | None] = mapped_column(Text)
-    shard: Mapped[int] = mapped_column(Integer)
-    shards: Mapped[int] = mapped_column(Integer)
     loaded: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
-    started_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     seen_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
 
     def has(self, generation_id: UUID, version: int) -> bool:
@@ -207,8 +201,6 @@ def upsert_search_worker(
     session: Session,
     worker_id: UUID,
     name: str,
-    url: str | None,
-    shard: Shard,
     loaded: Mapping[UUID, int],
     unreadable: Sequence[str] = (),
 ) -> None:
@@ -223,16 +215,7 @@ def upsert_search_worker(
         .execution_options(synchronize_session=False)
     )
     if not affected_rows(updated):  # new, or removed while it could not reach the catalog
-        session.add(
-            RegisteredSearchWorker(
-                id=worker_id,
-                name=name,
-                url=url,
-                shard=shard.index,
-                shards=shard.of,
-                loaded=versions,
-            )
-        )
+        session.add(RegisteredSearchWorker(id=worker_id, name=name, loaded=versions))
 
 
 def delete_search_worker(session: Session, worker_id: UUID) -> None:
@@ -263,23 +246,10 @@ def unreadable_keys(session: Session) -> set[str]:
 def list_lagging_workers(
     session: Session, generation_id: UUID, version: int
 ) -> list[RegisteredSearchWorker]:
-    """List the live workers that have not loaded the generation at `version` yet, by name.
-
-    Workers whose shards have no chunk of the generation are left out.
-    """
-    slots = session.scalars(
-        select(Chunk.slot)
-        .where(Chunk.generation_id == generation_id, Chunk.superseded_at.is_(None))
-        .distinct()
-    ).all()
+    """List the live workers that have not loaded the generation at `version` yet, by name."""
     live = session.scalars(
         select(RegisteredSearchWorker)
         .where(RegisteredSearchWorker.seen_at >= db_now_plus(-SEARCH_WORKER_TIMEOUT_SECONDS))
         .order_by(RegisteredSearchWorker.name, RegisteredSearchWorker.id)
     )
-    return [
-        worker
-        for worker in live
-        if any(Shard(worker.shard, worker.shards).owns(slot) for slot in slots)
-        and not worker.has(generation_id, version)
-    ]
+    return [worker for worker in live if not worker.has(generation_id, version)]

@@ -23,6 +23,7 @@ from shared.storage import ObjectStore
 from shared.storage.keys import reconstruction_prefix
 
 MIN_PHOTOS = 3
+HOW = "`placewise reconstruct`, or Reconstruction under Advanced on the page"
 MAX_PHOTOS = 3000
 """Of a map that is reconstructed: the time of bundle adjustment grows faster than their number"""
 
@@ -157,12 +158,11 @@ def get_reconstruction(session: Session, map_id: UUID) -> Reconstruction:
     """Return `find_reconstruction`; NotFound (`no_reconstruction`) says why there is none."""
     if (current := find_reconstruction(session, map_id)) is not None:
         return current
-    reason = "The map has no reconstruction yet. Make one: `placewise reconstruct`."
+    reason = f"The map has no reconstruction yet. Make one: {HOW}."
     if (other := session.scalar(_newest_finished(map_id))) is not None:
         reason = (
             f"The map's reconstruction is of local features of {other.features_model}, and the map "
-            f"now has {_features_model(session, map_id) or 'none'}. Make a new one: `placewise "
-            "reconstruct`."
+            f"now has {_features_model(session, map_id) or 'none'}. Make a new one: {HOW}."
         )
     raise NotFound("no_reconstruction", reason)
 

@@ -1,19 +1,22 @@
-"""Settings of search: catalog sync, memory budget, shards, ranking, location estimates."""
+"""Settings of search: catalog sync, memory budget, engine, ranking, location estimates."""
 
 from __future__ import annotations
 
 import math
 import re
+from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, SecretStr, field_validator
 from pydantic_settings import BaseSettings
 
-from shared.config.shards import Shard
 from shared.config.values import Size, split_list
+from shared.errors import Conflict
+
+MAX_MILVUS_DIMENSION = 32_768
 
 
 class SearchSettings(BaseSettings):
-    """How search workers follow the catalog, share the rows among them and rank results."""
+    """What search workers find rows with, and how they rank results."""
 
     estimate_radii_m: str = Field(
         "25,100,500,2000",
@@ -33,10 +36,23 @@ class SearchSettings(BaseSettings):
         "machine's memory, or of the container's memory limit",
     )
 
-    # Search workers on several machines (`placewise search`, which listens on HOST and PORT).
-    search_shard: str = Field(
-        "0/1", description="shard of this search worker: 1/3 is the second of three shards"
+    search_engine: Literal["placewise", "milvus"] = Field(
+        "placewise",
+        description="what search workers find rows with: their own memory, or Milvus, for maps "
+        "larger than one machine (needs the extra milvus)",
     )
+    milvus_uri: SecretStr | None = Field(
+        None,
+        description="URL of Milvus, with a user or a token if it needs one: "
+        "https://user:password@milvus:19530, https://token@milvus:19530; a file name that ends "
+        "in .db is opened with milvus-lite",
+    )
+    milvus_index: Literal["FLAT", "HNSW"] = Field(
+        "FLAT",
+        description="index of new collections in Milvus: FLAT compares all rows, HNSW only some",
+    )
+
+    # Search workers on several machines (`placewise search`, which listens on HOST and PORT).
     search_urls: str | None = Field(
         None,
         description="URLs of all search workers, separated by commas; unset: search runs in this "
@@ -54,11 +70,6 @@ class SearchSettings(BaseSettings):
             raise ValueError(f"{value!r} is not a list of radii in metres, such as 25,100,500")
         return value
 
-    @field_validator("search_shard")
-    @classmethod
-    def _check_shard(cls, value: str) -> str:
-        return str(Shard.parse(value))
-
     @field_validator("search_urls")
     @classmethod
     def _check_urls(cls, value: str | None) -> str | None:
@@ -70,6 +81,25 @@ class SearchSettings(BaseSettings):
                 )
         return value
 
+    @field_validator("milvus_uri")
+    @classmethod
+    def _check_milvus(cls, value: SecretStr | None) -> SecretStr | None:
+        uri = value.get_secret_value() if value else "x.db"
+        if not uri.endswith(".db") and not re.fullmatch(r"https?://[^\s/?#]+/?", uri):
+            raise ValueError("MILVUS_URI is not a URL such as http://milvus:19530")
+        return value
+
+    def check_row_length(self, dimension: int | None) -> None:
+        """Raise Conflict (`rows_too_long`) for rows that the search engine can't hold."""
+        if self.search_engine == "milvus" and (dimension or 0) > MAX_MILVUS_DIMENSION:
+            raise Conflict(
+                "rows_too_long",
+                f"Milvus holds rows of at most {MAX_MILVUS_DIMENSION} numbers, and these have "
+                f"{dimension}. Reduce the descriptors by PCA: placewise maps switch NAME --pca "
+                "8192, which is possible before Milvus has them.",
+                dimension=dimension,
+            )
+
     @property
     def level_radii_m(self) -> tuple[float, ...]:
         """The radii of the levels of an estimate in metres, ascending."""
@@ -79,11 +109,6 @@ class SearchSettings(BaseSettings):
     def estimate_radius_m(self) -> float:
         """Distance to the true position within which an estimate counts as correct, in metres."""
         return self.level_radii_m[0]
-
-    @property
-    def shard(self) -> Shard:
-        """The shard that this process's search worker holds."""
-        return Shard.parse(self.search_shard)
 
     @property
     def search_worker_urls(self) -> tuple[str, ...]:

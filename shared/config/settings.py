@@ -12,7 +12,7 @@ import os
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pydantic import Field, SecretStr, model_validator
+from pydantic import Field, SecretStr
 from pydantic.fields import FieldInfo
 from pydantic_settings import (
     BaseSettings,
@@ -24,12 +24,18 @@ from pydantic_settings import (
 from shared.config.extractor_settings import MAX_DECODE_PROCESSES, ExtractorSettings
 from shared.config.gateway_settings import GatewaySettings
 from shared.config.search_settings import SearchSettings
-from shared.config.shards import Shard
 from shared.config.storage_settings import StorageSettings
 from shared.errors import Misconfigured
 
 # Each may be given as NAME_FILE, too: the path of a file with the value, such as a mounted secret.
-SECRET_SETTINGS = ("ADMIN_KEY", "DATABASE_URL", "REDIS_URL", "S3_ACCESS_KEY", "S3_SECRET_KEY")
+SECRET_SETTINGS = (
+    "ADMIN_KEY",
+    "DATABASE_URL",
+    "MILVUS_URI",
+    "REDIS_URL",
+    "S3_ACCESS_KEY",
+    "S3_SECRET_KEY",
+)
 
 GPU_BATCH_PHOTOS = 64  # more at once are hardly faster: docs/how-to/throughput.md
 CGROUP_MEMORY_LIMIT_FILE = Path("/sys/fs/cgroup/memory.max")
@@ -176,15 +182,6 @@ class Settings(
         """Add files with secrets to the sources: arguments, environment, `.env`, files."""
         return (init_settings, env_settings, dotenv_settings, SecretFilesSource(settings_cls))
 
-    @model_validator(mode="after")
-    def _check_batch_fits_slot(self) -> Self:
-        if self.batch_photos > self.slot_rows:
-            raise ValueError(
-                f"BATCH_PHOTOS ({self.batch_photos}) may not exceed SLOT_ROWS ({self.slot_rows}): "
-                "a batch becomes one chunk, and a chunk must fit into a slot"
-            )
-        return self
-
     def for_device(self, device: str) -> Self:
         """Return the settings of an extractor on `cpu` or `cuda`, which decides what is unset."""
         processors = len(os.sched_getaffinity(0))
@@ -192,13 +189,14 @@ class Settings(
         decoders = max(decoders, 2) * (1 if self.s3_endpoint is None else 2)
         chosen = {"decode_processes": min(decoders, MAX_DECODE_PROCESSES)}
         if device == "cuda":
-            chosen["batch_photos"] = min(GPU_BATCH_PHOTOS, self.slot_rows)
+            chosen["batch_photos"] = GPU_BATCH_PHOTOS
         unset = chosen.keys() - self.model_fields_set
         return self.model_copy(update={name: chosen[name] for name in unset})
 
-    def search_cache_folder(self, shard: Shard) -> Path:
-        """The folder where the search worker of a shard caches objects of a bucket."""
-        return self.placewise_home / "search-cache" / str(shard).replace("/", "-of-")
+    @property
+    def search_cache_folder(self) -> Path:
+        """The folder where search workers cache objects of a bucket."""
+        return self.placewise_home / "search-cache"
 
     @property
     def search_memory_bytes(self) -> int:

@@ -54,7 +54,7 @@ class StorageSettings(BaseSettings):
     )
 
     # Compaction and garbage collection.
-    slot_rows: int = Field(1000, ge=2, description="rows of a sealed chunk")
+    chunk_rows: int = Field(1000, ge=2, description="most rows of a merged chunk")
     orphan_age_seconds: float = Field(
         86_400.0,
         ge=0,

@@ -76,7 +76,7 @@ TABLES: dict[str, type[Journaled]] = {
 UNJOURNALED_COLUMNS = {
     "photos": {"changed_version"},
     "maps": {"version"},
-    "generations": {"open_slot", "open_slot_rows", "complete_version", "complete_at"},
+    "generations": {"complete_version", "complete_at"},
 }
 REVISION_COLUMNS = {"revision", "journaled_revision"}
 

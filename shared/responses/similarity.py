@@ -308,6 +308,6 @@ class SimilarityResponse(ResponseModel):
         False, description="true: `missing` names parts of the map that could not be searched"
     )
     missing: list[str] = Field(
-        description="what could not be searched: unreadable chunks (`chunks/....npy`) and shards "
-        "without a search worker (`shard 1/3`)"
+        description="what could not be searched: chunks (`chunks/....npy`) that are unreadable, or "
+        "still to be written to the search engine"
     )

@@ -12,7 +12,7 @@ from uuid import UUID
 
 from pydantic import AfterValidator, BaseModel, ConfigDict
 
-from shared.geodesy import flush_to_zero
+from shared.geodesy import flush_to_zero, latitude_bounds, longitude_half_width
 
 _ASCII_LOWER = str.maketrans(ascii_uppercase, ascii_lowercase)
 Coordinate = Annotated[float, AfterValidator(flush_to_zero)]
@@ -20,14 +20,6 @@ Coordinate = Annotated[float, AfterValidator(flush_to_zero)]
 
 class _FilterModel(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Circle(_FilterModel):
-    """All points within `radius_m` metres (inclusive) of a point in degrees."""
-
-    latitude: Coordinate
-    longitude: Coordinate
-    radius_m: float
 
 
 class Box(_FilterModel):
@@ -54,6 +46,28 @@ class Box(_FilterModel):
         if self.west == -180.0:
             ranges.append((180.0, 180.0))
         return ranges
+
+
+class Circle(_FilterModel):
+    """All points within `radius_m` metres (inclusive) of a point in degrees."""
+
+    latitude: Coordinate
+    longitude: Coordinate
+    radius_m: float
+
+    def bounding_box(self) -> Box:
+        """Return a box that holds the circle; some of its points are farther away."""
+        south, north = latitude_bounds(self.latitude, self.radius_m)
+        half_width = longitude_half_width(self.latitude, self.radius_m)
+        west, east = -180.0, 180.0
+        if half_width is not None and half_width < 180:
+            west, east = self.longitude - half_width, self.longitude + half_width
+        return Box(
+            south=max(south, -90.0),
+            west=west + 360 if west < -180 else west,
+            north=min(north, 90.0),
+            east=east - 360 if east > 180 else east,
+        )
 
 
 class PhotoFilter(_FilterModel):

@@ -2,8 +2,7 @@
 
 A query is a reference to one descriptor row in the object store, never the vector itself, so no
 vector passes through the gateway. `SearchBackend` is implemented in process by
-`services.search.worker.SearchWorker`, and over HTTP by `shared.search_api.client.HttpSearchClient`,
-which spreads a map's slots over shards.
+`services.search.worker.SearchWorker`, and over HTTP by `shared.search_api.client.HttpSearchClient`.
 """
 
 from __future__ import annotations
@@ -14,16 +13,16 @@ from uuid import UUID
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from shared.config.shards import SINGLE_SHARD
 from shared.geometry.colmap_model import ColmapCamera
 from shared.responses.similarity import PointPair, SeenPoint
 from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
 
 EXHAUSTIVE = "exhaustive"  # every row was compared exactly
 STATISTICAL = "statistical"  # no other row can be among them, but with odds of about 1 in 10^8
+APPROXIMATE = "approximate"  # chosen by an approximate index, or within the engine's limit
 NONE = "none"  # a part of the map is missing: better rows may exist
 
-CERTIFICATES = (EXHAUSTIVE, STATISTICAL, NONE)
+CERTIFICATES = (EXHAUSTIVE, STATISTICAL, APPROXIMATE, NONE)
 """Guarantees of a result's completeness, strongest first."""
 
 
@@ -96,8 +95,10 @@ class SearchResponse(_Message):
     """Largest error of a sign-code estimate, in standard deviations; None if none was made."""
     snapshot_version: int
     missing: tuple[str, ...] = ()
-    """Objects that could not be read, and shards (`shard 1/3`) without an answering worker; their
-    photos are not in the result."""
+    """Objects that could not be read or are not in the engine yet; their photos are not in the
+    result."""
+    filling: bool = False
+    """Whether some of them are still to be written to the engine."""
 
 
 class ReplicationLag(_Message):
@@ -109,48 +110,29 @@ class ReplicationLag(_Message):
     """Whether the generation is active, and so serves queries; False while it is being built."""
 
 
-class IndexPart(_Message):
-    """One part of a generation's search index: a level of its codes, or its rows."""
-
-    name: str
-    size_bytes: int
-    resident: bool
-    """Whether it is held in memory; otherwise it is a mapped file in the system's page cache."""
-
-
-class LoadedGeneration(_Message):
-    """A generation that a worker has loaded."""
-
-    rows: int
-    """Including the rows of deleted photos."""
-    dimension: int
-    parts: tuple[IndexPart, ...]
-
-
 class SearchStatus(_Message):
     """State of a worker: rows and bytes in memory, and the loaded version of each generation.
 
-    For several workers together: the sums, and the lowest version among the shards.
+    For several workers together: that of the most advanced one.
     """
 
-    shard: str = str(SINGLE_SHARD)
     rows: int
     resident_bytes: int
     mapped_bytes: int = 0
     """Bytes of mapped files that are not resident."""
     versions: dict[UUID, int]
-    held: dict[UUID, LoadedGeneration] = {}
-    """Loaded generations; empty for several workers together."""
     incomplete: tuple[UUID, ...] = ()
-    """Generations with an unreadable chunk."""
+    """Generations with a chunk that can't be searched."""
     missing: tuple[str, ...]
     """Object keys of unreadable chunks."""
+    unwritten: int = 0
+    """Chunks that are still to be written to Milvus."""
     disk_full: bool = False
     """Whether some are unreadable only because a worker's cache is on a full disk."""
     lags: dict[UUID, ReplicationLag] = {}
     """Replication lag by generation; empty for a worker that does not follow the catalog."""
-    unavailable: tuple[str, ...] = ()
-    """Shards without an answering worker, as `SearchResponse.missing` names them."""
+    recalls: dict[UUID, float] = {}
+    """Measured recall of the generations that are searched by an approximate index"""
 
     @property
     def loaded(self) -> dict[UUID, int]:

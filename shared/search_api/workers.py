@@ -1,7 +1,6 @@
-"""Directory of search workers and their shards, refreshed by polling their status.
+"""Directory of search workers, refreshed by polling their status.
 
-`WorkerDirectory` polls every worker each second and orders the workers of each shard by how well
-they can answer.
+`WorkerDirectory` polls every worker each second and orders them by how well they can answer.
 """
 
 from __future__ import annotations
@@ -9,12 +8,11 @@ from __future__ import annotations
 import logging
 import random
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from uuid import UUID
 
-from shared.config.shards import Shard
 from shared.errors import PlacewiseError
 from shared.search_api.protocol import SearchStatus
 
@@ -45,11 +43,6 @@ class _WorkerState:
     is_up: bool = False
     silent: bool = False
     """Its last status call timed out: a query to it would probably time out, too."""
-
-    @property
-    def shard(self) -> Shard | None:
-        """The shard that the worker serves; None while it is unknown."""
-        return None if self.status is None else Shard.parse(self.status.shard)
 
     def version(self, generation_id: UUID) -> int:
         """Loaded version of the generation at the last poll; -1 if it is not loaded."""
@@ -94,7 +87,7 @@ class WorkerDirectory:
             if worker.is_up and status is None:
                 log.warning("a search worker is unreachable: %s", reason)
             elif known and not worker.is_up and status is not None:
-                log.info("the search worker %s answers again: %s", worker.url, status.shard)
+                log.info("the search worker %s answers again", worker.url)
             worker.is_up, worker.silent = status is not None, silent
             worker.status = status or worker.status
 
@@ -105,75 +98,29 @@ class WorkerDirectory:
                 if worker.url == url:
                     worker.is_up = False
 
-    def layout(self, generation_id: UUID, min_version: int) -> dict[Shard, list[str]]:
-        """Return every shard with its workers' URLs, best first; {} while no worker is known.
+    def urls(self, generation_id: UUID | None = None, min_version: int = 0) -> list[str]:
+        """Return the URLs of the workers, best first.
 
-        While a deployment changes the number of shards, workers of different numbers run side by
-        side. The number with the larger share of shards that have loaded the generation is used; of
-        equals, the larger number.
+        Those that have loaded the generation come before those that have not.
         """
         with self._lock:
-            best = self._best_workers(generation_id)
-            order = random.sample(best, len(best))  # balances the load over replicas
-            order.sort(
+            workers = random.sample(self._workers, len(self._workers))  # balances the load
+            workers.sort(
                 key=lambda worker: (
+                    worker.silent,
                     not worker.is_up,
-                    worker.version(generation_id) < min_version,
-                    worker.lacks_chunks(generation_id),
+                    generation_id is not None
+                    and (
+                        worker.version(generation_id) < min_version,
+                        worker.lacks_chunks(generation_id),
+                    ),
                 )
             )
-            return {
-                shard: [w.url for w in order if w.shard == shard and not w.silent]
-                for shard in _shards_of(best)
-            }
+            # A query to a silent worker would wait for nothing.
+            return [w.url for w in workers if generation_id is None or not w.silent]
 
-    def urls(self) -> list[str]:
-        """Return the URLs of all workers of any shard, best first."""
+    def best_status(self) -> SearchStatus | None:
+        """Return the state of the most advanced worker that answers; None if none does."""
         with self._lock:
-            workers = random.sample(self._workers, len(self._workers))
-            workers.sort(key=lambda worker: (not worker.is_up, worker.silent))
-            return [worker.url for worker in workers]
-
-    def statuses(self) -> tuple[dict[Shard, SearchStatus], list[Shard]]:
-        """Return the state of each shard's most advanced worker, and the shards without one."""
-        with self._lock:
-            best = self._best_workers(None)
-            statuses: dict[Shard, SearchStatus] = {}
-            for worker in sorted(best, key=_total_version):
-                if worker.is_up and worker.shard is not None and worker.status is not None:
-                    statuses[worker.shard] = worker.status
-            return statuses, [shard for shard in _shards_of(best) if shard not in statuses]
-
-    def _best_workers(self, generation_id: UUID | None) -> list[_WorkerState]:
-        """The workers of the best number of shards."""
-        shard_counts = {worker.shard.of for worker in self._workers if worker.shard}
-        groups = {
-            count: [worker for worker in self._workers if worker.shard and worker.shard.of == count]
-            for count in shard_counts
-        }
-
-        def rank(count: int) -> tuple[float, float, int]:
-            up = [worker for worker in groups[count] if worker.is_up]
-            loaded = (
-                up if generation_id is None else [w for w in up if w.version(generation_id) >= 0]
-            )
-            return _shard_coverage(loaded, count), _shard_coverage(up, count), count
-
-        return groups[max(groups, key=rank)] if groups else []
-
-
-def _shard_coverage(workers: Iterable[_WorkerState], count: int) -> float:
-    """Share of the shards that the workers hold."""
-    return len({worker.shard for worker in workers}) / count
-
-
-def _shards_of(workers: Sequence[_WorkerState]) -> list[Shard]:
-    """All shards of the workers' common number, including those that no worker serves."""
-    count = next((worker.shard.of for worker in workers if worker.shard), 0)
-    return [Shard(index, count) for index in range(count)]
-
-
-def _total_version(worker: _WorkerState) -> tuple[int, bool]:
-    if worker.status is None:
-        return 0, False
-    return sum(worker.status.versions.values()), not worker.status.missing
+            found = [worker.status for worker in self._workers if worker.is_up and worker.status]
+        return max(found, key=lambda s: (sum(s.versions.values()), not s.missing), default=None)

@@ -23,15 +23,8 @@ def bring_in(city: CityServer, *names: str) -> list[str]:
     ids = []
     for name in names:
         number = sum(map(ord, name))
-        answer = city.server.client.post(
-            "/api/v1/upload",
-            params={"map": MAP},
-            files={"file": (name, photo_bytes(number))},
-            data={"role": "query", "latitude": "44.0", "longitude": "8.7", "tags": "first"},
-            headers={"Prefer": "wait=60"},
-        )
-        assert answer.status_code == 201, answer.text
-        ids.append(answer.json()["file_id"])
+        fields = {"role": "query", "latitude": 44, "longitude": 8.7, "tags": "first"}
+        ids.append(city.server.indexed(photo_bytes(number), name, MAP, **fields))
     return ids
 
 

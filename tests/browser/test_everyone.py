@@ -11,7 +11,7 @@ from playwright.sync_api import Page, expect
 from tests.browser.conftest import CityServer, Visitor
 
 VIEWS = ["ask", "answer", "compare", "photos", "photo", "tracks", "track"]
-VIEWS += ["add", "locate", "places", "trash", "model", "status"]
+VIEWS += ["add", "locate", "places", "trash", "model", "reconstruction", "status"]
 SERIOUS = {"serious", "critical"}
 
 
@@ -38,20 +38,23 @@ def open_view(visitor: Visitor, city: CityServer, view: str) -> Page:
     return page
 
 
+def serious_faults(page: Page) -> list[str]:
+    """The serious accessibility faults of the page as it is shown."""
+    return [
+        f"{fault['id']}: {node['html'][:200]} {node['failureSummary']}"
+        for fault in Axe().run(page)["violations"]
+        if fault["impact"] in SERIOUS
+        for node in fault["nodes"]
+    ]
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("view", VIEWS)
 def test_no_view_has_a_serious_accessibility_fault(
     visitor: Visitor, city: CityServer, view: str, scheme: Any
 ) -> None:
     visitor.page.emulate_media(color_scheme=scheme)
-    page = open_view(visitor, city, view)
-    faults = [
-        f"{fault['id']}: {node['html'][:200]} {node['failureSummary']}"
-        for fault in Axe().run(page)["violations"]
-        if fault["impact"] in SERIOUS
-        for node in fault["nodes"]
-    ]
-    assert faults == []
+    assert serious_faults(open_view(visitor, city, view)) == []
 
 
 @pytest.mark.parametrize("view", VIEWS)

@@ -56,7 +56,7 @@ def fleet() -> Iterator[Fleet]:
         lease_seconds=5.0,
         batch_photos=BATCH_PHOTOS,
     ) as opened:
-        opened.start("search-0-0", "gateway-0", "steward-0")
+        opened.start("search-0", "gateway-0", "steward-0")
         yield opened
 
 

@@ -23,14 +23,7 @@ def unplaced(city: CityServer, tmp_path: Path) -> Iterator[list[str]]:
         path = tmp_path / f"unplaced-{number}.jpg"
         with Image.open(original) as image:
             image.point(lambda value: int(value * 0.9)).save(path)
-        answer = city.server.client.post(
-            "/api/v1/upload",
-            params={"map": MAP},
-            files={"file": (path.name, path.read_bytes())},
-            headers={"Prefer": "wait=60"},
-        )
-        assert answer.status_code == 201, answer.text
-        ids.append(answer.json()["file_id"])
+        ids.append(city.server.indexed(path.read_bytes(), path.name, MAP))
     yield ids
     for file_id in ids:
         params = {"map": MAP, "permanently": "true"}

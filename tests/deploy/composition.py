@@ -16,7 +16,7 @@ from typing import Any
 ROOT = Path(__file__).parents[2]
 SERVICES = ROOT / "docker-compose.yml"
 EMBEDDED = ROOT / "docker-compose.embedded.yml"
-PROFILES = ("cpu", "gpu", "seaweedfs", "flower", "monitoring")
+PROFILES = ("cpu", "gpu", "seaweedfs", "flower", "milvus", "monitoring")
 
 Json = dict[str, Any]
 

@@ -54,11 +54,9 @@ def of_kind(name: str, *kinds: str) -> list[Json]:
 
 
 def component(manifest: Json) -> str:
-    """`gateway`, `search-0`, `migrate`: of the labels, not of the name."""
-    labels = manifest["metadata"]["labels"]
-    shard = labels.get("placewise/shard")
-    part: str = labels["app.kubernetes.io/component"]
-    return part if shard is None else f"{part}-{shard}"
+    """`gateway`, `search`, `migrate`: of the labels, not of the name."""
+    part: str = manifest["metadata"]["labels"]["app.kubernetes.io/component"]
+    return part
 
 
 def by_component(name: str, *kinds: str) -> dict[str, Json]:
@@ -209,7 +207,7 @@ def test_no_manifest_holds_a_secret_and_each_pod_gets_only_its_own(name: str) ->
     }
     as_files = example(name).get("secrets", {}).get("asFiles", False)
     for part, workload in by_component(name, *WORKLOADS).items():
-        names = expected[part.partition("-")[0] if part.startswith("search") else part]
+        names = expected[part] | ({"MILVUS_URI"} if (name, part) == ("milvus", "search") else set())
         assert names <= set(SECRET_SETTINGS)
         volumes = {one["name"]: one for one in pod(workload)["spec"]["volumes"]}
         if as_files:
@@ -279,9 +277,7 @@ def test_search_urls_name_every_worker_that_autoscaling_may_start(name: str) -> 
         )
         assert service["spec"]["clusterIP"] == "None"
     assert set(settings_of(name)["SEARCH_URLS"].split(",")) == urls
-    shards = {variables(worker)["SEARCH_SHARD"]["value"] for worker in workers}
-    assert shards == {f"{number}/{len(workers)}" for number in range(len(workers))}
-    assert len(workers) == (3 if name == "production" else 2)
+    assert len(workers) == 1
 
 
 @EACH

@@ -100,8 +100,8 @@ def deployment(tmp_path: Path, postgres: PostgresServer) -> Iterator[Deployment]
 def test_services_in_processes_of_their_own_do_what_the_embedded_one_does(
     deployment: Deployment,
 ) -> None:
-    deployment.start("search", search_shard="0/2")
-    deployment.start("search", search_shard="1/2")
+    deployment.start("search")
+    deployment.start("search")
     urls = [deployment.address("search", number) for number in (0, 1)]
     deployment.settings["search_urls"] = ",".join(urls)
     deployment.start("gateway")
@@ -177,7 +177,7 @@ def test_services_in_processes_of_their_own_do_what_the_embedded_one_does(
 def test_a_thread_that_crashes_ends_its_process(
     service: str, threads: list[str], deployment: Deployment
 ) -> None:
-    deployment.settings |= {"search_urls": "http://127.0.0.1:9", "search_shard": "0/1"}
+    deployment.settings |= {"search_urls": "http://127.0.0.1:9"}
     if service == "serve":
         deployment.settings |= {"search_urls": "", "database_url": ""}
     processes = [
@@ -185,7 +185,7 @@ def test_a_thread_that_crashes_ends_its_process(
         for name in threads
     ]
     for number, process in enumerate(processes):
-        deployment.announced(service, number, r"Placewise (.*(serves|is running))")
+        deployment.announced(service, number, r"Placewise (.*(serves|listens|is running))")
         process.send_signal(signal.SIGRTMIN)
         if threads[number] == "extractor" and service == "serve":
             (extractor,) = psutil.Process(process.pid).children()

@@ -41,7 +41,7 @@ CLOCK_OFFSETS_SECONDS = {
     "gateway-1": 600,
     "extractor-1": 600,
     "extractor-2": -600,
-    "search-1-0": -600,
+    "search-1": -600,
     "steward-0": 600,
 }
 SHORT = {
@@ -121,10 +121,10 @@ def _duplicate_messages() -> Fault:
 
 
 FAULTS = [
-    *map(_kill, ("gateway-0", "extractor-0", "search-0-0", "search-1-0", "steward-0")),
+    *map(_kill, ("gateway-0", "extractor-0", "search-0", "search-1", "steward-0")),
     Fault("kill -9 of every service at once", Fleet.kill_all, Fleet.start),
     _pause("an extractor stands still beyond its lease", "extractor-0"),
-    _pause("a search worker stands still", "search-0-0"),
+    _pause("a search worker stands still", "search-0"),
     Fault("FLUSHALL", lambda f: f.servers.redis.flush(), lambda f: f.servers.redis.flush()),
     _stop("Redis stopped", "Redis"),
     _stop("Redis stopped for two minutes", "Redis", 120.0),
@@ -252,7 +252,7 @@ class Traffic:
             headers={"Prefer": "wait=10"},
         )
         if body is None or "similar_images" not in body or body["missing"]:
-            return  # retried, not ready in time, or a shard is missing
+            return  # retried, not ready in time, or a chunk is missing
         found = body["similar_images"]
         ids = [photo["image_id"] for photo in found]
         if (
@@ -295,13 +295,13 @@ def fleet() -> Iterator[Fleet]:
     with open_fleet(
         gateways=2,
         extractors=3,
-        shards=2,
+        replicas=2,
         through_proxies=True,
         executed=not IS_SHORT,
         extractor="test-slow-avg:milliseconds=20,width=256",  # so that a kill finds it at work
         lease_seconds=2.0,
         batch_photos=8,
-        slot_rows=50,
+        chunk_rows=50,
     ) as opened:
         for name, seconds in CLOCK_OFFSETS_SECONDS.items():
             opened[name].environment.update(clock_off_by(seconds))

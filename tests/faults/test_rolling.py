@@ -21,7 +21,7 @@ from tests.support.photos import photo_bytes
 from tests.support.server import SERVICES_KEY
 from tests.support.waiting import wait_until
 
-ONE_OF_EACH = ("gateway-0", "extractor-0", "search-0-0", "steward-0")
+ONE_OF_EACH = ("gateway-0", "extractor-0", "search-0", "steward-0")
 FIRST_PHOTOS = 12
 PAUSE_SECONDS = 0.1  # between a client's requests, so that the CPU is not saturated
 

@@ -16,7 +16,8 @@ import numpy as np
 from sqlalchemy import select, text, update
 from sqlalchemy.orm import Session
 
-from shared.catalog.chunks import Chunk, Descriptor, allocate_slot
+from services.steward.tasks.compaction import merge_chunks
+from shared.catalog.chunks import Chunk, Descriptor, list_live_chunks
 from shared.catalog.database.base import db_now, db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, lock_generation
@@ -33,6 +34,7 @@ from shared.storage import ObjectStore
 from shared.storage.chunks import Rows, StoredRows, read_chunk, write_chunk
 from shared.storage.feature_files import FeatureRows
 from shared.storage.keys import component_key, new_original_key, query_key
+from shared.storage.read_retries import ReadRetries
 
 NUMBERS = itertools.count(1)
 PRIORITIES = {
@@ -192,16 +194,13 @@ def add_chunk(
     store: ObjectStore,
     generation_id: UUID,
     photo_ids: list[UUID],
-    slot_rows: int = 1000,
     rows: StoredRows | None = None,
-    slot: int | None = None,
     dead: int = 0,
     features: FeatureRows | None = None,
 ) -> UUID:
     """Publish a chunk with a row for each photo, `row_of` it by default, and return its id.
 
     Args:
-        slot: The chunk's slot. By default one with room is allocated.
         dead: Number of rows at the beginning that no photo refers to, as after a lost lease.
     """
     chunk_id = new_id()
@@ -216,16 +215,7 @@ def add_chunk(
     )
     with catalog.write() as session:
         generation = lock_generation(session, generation_id)
-        session.add(
-            Chunk(
-                id=chunk_id,
-                generation_id=generation_id,
-                slot=(
-                    allocate_slot(generation, len(photo_ids), slot_rows) if slot is None else slot
-                ),
-                **asdict(written),
-            )
-        )
+        session.add(Chunk(id=chunk_id, generation_id=generation_id, **asdict(written)))
         session.flush()
         session.add_all(
             Descriptor(generation_id=generation_id, photo_id=photo_id, chunk_id=chunk_id, row=row)
@@ -234,6 +224,13 @@ def add_chunk(
         )
         increment_map_version(session, generation.map_id)
     return chunk_id
+
+
+def merge_all(catalog: Catalog, store: ObjectStore, generation_id: UUID) -> bool:
+    """Merge all chunks of the generation into one; False if that can't be done."""
+    with catalog.read() as session:
+        chunk_ids = [chunk.id for chunk in list_live_chunks(session, generation_id)]
+    return merge_chunks(catalog, store, generation_id, chunk_ids, ReadRetries())
 
 
 def row_of(photo_id: UUID) -> Rows:

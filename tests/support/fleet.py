@@ -10,7 +10,6 @@ It needs a checkout with the extra `dev`, because the servers are those of the t
 from __future__ import annotations
 
 import contextlib
-import itertools
 import signal
 import tempfile
 import threading
@@ -195,7 +194,7 @@ class ServiceProcess:
 
 
 class Fleet:
-    """Services by name: `gateway-0..`, `extractor-0..`, `search-SHARD-REPLICA`, `steward-0..`.
+    """Services by name: `gateway-0..`, `extractor-0..`, `search-0..`, `steward-0..`.
 
     Settings are those of `shared.config.settings`; the default extractor is the tiny test
     extractor.
@@ -208,7 +207,6 @@ class Fleet:
         *,
         gateways: int = 1,
         extractors: int = 1,
-        shards: int = 1,
         replicas: int = 1,
         stewards: int = 1,
         through_proxies: bool = False,
@@ -236,12 +234,9 @@ class Fleet:
             database_url = database_url.set(port=servers.proxies["PostgreSQL"].port)
             redis_url = redis_url.set(port=servers.proxies["Redis"].port)
             s3 = replace(s3, endpoint=f"127.0.0.1:{servers.proxies['the S3 store'].port}")
-        ports = iter(free_ports(gateways + shards * replicas))
-        searches = {
-            (shard, replica): next(ports)
-            for shard, replica in itertools.product(range(shards), range(replicas))
-        }
-        self.search_urls = [f"http://127.0.0.1:{port}" for port in searches.values()]
+        ports = iter(free_ports(gateways + replicas))
+        searches = [next(ports) for _ in range(replicas)]
+        self.search_urls = [f"http://127.0.0.1:{port}" for port in searches]
         self._settings = {
             "database_url": database_url.render_as_string(hide_password=False),
             "redis_url": redis_url.render_as_string(hide_password=False),
@@ -253,8 +248,8 @@ class Fleet:
         }
         self.lease_seconds = float(settings.get("lease_seconds", 60.0))
         self.services: dict[str, ServiceProcess] = {}
-        for (shard, replica), port in searches.items():
-            self._add(f"search-{shard}-{replica}", port, search_shard=f"{shard}/{shards}")
+        for replica, port in enumerate(searches):
+            self._add(f"search-{replica}", port)
         self.gateway_urls: list[str] = []
         for number in range(gateways):
             port = next(ports)

@@ -1,10 +1,9 @@
-"""Real search servers in threads, shard by shard, with the client in front of them."""
+"""Real search servers in threads, with the client in front of them."""
 
 from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Sequence
 from types import TracebackType
 from typing import Self
 
@@ -16,8 +15,7 @@ from services.search.service import create_search_app
 from services.search.worker import MAX_WAIT_SECONDS, SearchWorker
 from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
-from shared.config.shards import Shard
-from shared.search_api.client import SHARD_TIMEOUT_SECONDS, HttpSearchClient
+from shared.search_api.client import SEARCH_TIMEOUT_SECONDS, HttpSearchClient
 from shared.storage import ObjectStore
 from tests.support.waiting import wait_until
 
@@ -35,10 +33,9 @@ class SearchServer:
         catalog: Catalog,
         store: ObjectStore,
         settings: Settings,
-        shard: Shard,
         max_wait_seconds: float,
     ) -> None:
-        self._of = (catalog, store, settings, shard)
+        self._of = (catalog, store, settings)
         self._max_wait_seconds = max_wait_seconds
         self._port = 0
         self._running: tuple[uvicorn.Server, threading.Thread, contextlib.ExitStack] | None = None
@@ -78,26 +75,23 @@ class SearchServer:
 
 
 class SearchTier:
-    """`replicas[i]` servers of shard i, and `port`, the client of them all."""
+    """`servers`, and `port`, the client of them all."""
 
     def __init__(
         self,
         catalog: Catalog,
         store: ObjectStore,
         settings: Settings,
-        replicas: Sequence[int] = (1,),
+        replicas: int = 1,
         max_wait_seconds: float = MAX_WAIT_SECONDS,
-        timeout_seconds: float = SHARD_TIMEOUT_SECONDS,
+        timeout_seconds: float = SEARCH_TIMEOUT_SECONDS,
     ) -> None:
-        shards = [Shard(index, len(replicas)) for index in range(len(replicas))]
         self.servers = [
-            [SearchServer(catalog, store, settings, shard, max_wait_seconds) for _ in range(count)]
-            for shard, count in zip(shards, replicas, strict=True)
+            SearchServer(catalog, store, settings, max_wait_seconds) for _ in range(replicas)
         ]
-        for server in self._all():
+        for server in self.servers:
             server.wait_until_started()
-        urls = [server.url for server in self._all()]
-        self.port = HttpSearchClient(urls, timeout_seconds)
+        self.port = HttpSearchClient([server.url for server in self.servers], timeout_seconds)
 
     def __enter__(self) -> Self:
         self.port.__enter__()
@@ -110,15 +104,12 @@ class SearchTier:
         trace: TracebackType | None,
     ) -> None:
         self.port.__exit__(kind, error, trace)
-        for server in self._all():
+        for server in self.servers:
             server.ask_to_stop()
-        for server in self._all():
+        for server in self.servers:
             server.stop()
-
-    def _all(self) -> list[SearchServer]:
-        return [server for shard in self.servers for server in shard]
 
     def follow(self) -> None:
         """Every worker brings itself up to date."""
-        for server in self._all():
+        for server in self.servers:
             server.worker.sync()

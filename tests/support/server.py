@@ -217,15 +217,20 @@ class ServerProcess:
 
     # What most tests do over HTTP.
 
-    def upload(self, data: bytes, name: str = "photo.jpg", **fields: Any) -> httpx2.Response:
+    def upload(
+        self, data: bytes, name: str = "photo.jpg", map_name: str = "default", **fields: Any
+    ) -> httpx2.Response:
         form = {key: str(value) for key, value in fields.items()}
-        return self.client.post("/api/v1/upload", files={"file": (name, data)}, data=form)
+        params, files = {"map": map_name}, {"file": (name, data)}
+        return self.client.post("/api/v1/upload", params=params, files=files, data=form)
 
-    def indexed(self, data: bytes, name: str = "photo.jpg", **fields: Any) -> str:
+    def indexed(
+        self, data: bytes, name: str = "photo.jpg", map_name: str = "default", **fields: Any
+    ) -> str:
         """Upload and wait until it is searchable; the photo's id."""
-        answer = self.upload(data, name, **fields)
+        answer = self.upload(data, name, map_name, **fields)
         assert answer.status_code in (200, 202), answer.text
-        job = self.finished(answer.json()["job_id"])
+        job = self.finished(answer.json()["job_id"], map=map_name)
         assert job["state"] == "succeeded", job
         file_id: str = answer.json()["file_id"]
         return file_id

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import select
 
-from services.steward.tasks.compaction import merge_slot
 from shared.catalog.chunks import Chunk, Descriptor, list_live_chunks
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import RowType
@@ -22,7 +21,14 @@ from shared.search_api.photo_filter import PhotoFilter
 from shared.search_api.protocol import SearchRequest, SearchResponse
 from shared.storage import ObjectStore
 from shared.storage.chunks import encode_rows
-from tests.support.catalog_rows import add_chunk, add_generation, add_map, delete, made_up_photo
+from tests.support.catalog_rows import (
+    add_chunk,
+    add_generation,
+    add_map,
+    delete,
+    made_up_photo,
+    merge_all,
+)
 
 DIMENSION = 12
 NOON = datetime(2024, 5, 6, 12, tzinfo=UTC)
@@ -65,7 +71,6 @@ class SmallMap:
     def add(
         self,
         rows: Rows,
-        slot: int = 0,
         dead: int = 0,
         about: Callable[[int], dict[str, Any]] = lambda row: {},
     ) -> list[UUID]:
@@ -81,7 +86,6 @@ class SmallMap:
         add_chunk(
             *(self.catalog, self.store, self.generation_id, photo_ids),
             rows=stored,
-            slot=slot,
             dead=dead,
         )
         self.rows |= dict(list(zip(photo_ids, stored.astype(np.float32), strict=True))[dead:])
@@ -100,8 +104,8 @@ class SmallMap:
         delete(self.catalog, self.map_id, photo_id)
         del self.rows[photo_id]
 
-    def merge(self, slot: int = 0) -> bool:
-        return merge_slot(self.catalog, self.store, self.generation_id, slot)
+    def merge(self) -> bool:
+        return merge_all(self.catalog, self.store, self.generation_id)
 
     def chunk_keys(self) -> list[str]:
         with self.catalog.read() as session:

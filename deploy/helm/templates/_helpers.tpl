@@ -2,14 +2,11 @@
 {{ .Values.nameOverride | default .Release.Name | trunc 40 | trimSuffix "-" }}
 {{- end }}
 
-{{/* Labels that select the pods of a component. Takes a dict of root, component and, for search, shard. */}}
+{{/* Labels that select the pods of a component. Takes a dict of root and component. */}}
 {{- define "placewise.selector" -}}
 app.kubernetes.io/name: placewise
 app.kubernetes.io/instance: {{ .root.Release.Name }}
 app.kubernetes.io/component: {{ .component }}
-{{- if hasKey . "shard" }}
-placewise/shard: {{ .shard | quote }}
-{{- end }}
 {{- end }}
 
 {{- define "placewise.labels" -}}
@@ -33,10 +30,8 @@ annotations:
 {{- define "placewise.settings" -}}
 {{- $name := include "placewise.name" . }}
 {{- $urls := list }}
-{{- range $shard := until (int .Values.search.shards) }}
-{{- range $replica := until (int $.Values.search.replicas.max) }}
-{{- $urls = append $urls (printf "http://%s-search-%d-%d.%s-search-%d:8000" $name $shard $replica $name $shard) }}
-{{- end }}
+{{- range $replica := until (int .Values.search.replicas.max) }}
+{{- $urls = append $urls (printf "http://%s-search-%d.%s-search:8000" $name $replica $name) }}
 {{- end }}
 {{- $fixed := dict "HOST" "0.0.0.0" "PORT" "8000" "METRICS_PORT" "9100" "SEARCH_URLS" (join "," $urls) }}
 {{- range $setting, $value := merge $fixed .Values.settings }}
@@ -45,7 +40,7 @@ annotations:
 {{- end }}
 {{- end }}
 
-{{/* What every pod has in common: no privileges. Takes root, component and, for search, shard; values of the component in `values`. */}}
+{{/* What every pod has in common: no privileges. Takes root and component; values of the component in `values`. */}}
 {{- define "placewise.podSpec" -}}
 automountServiceAccountToken: false
 enableServiceLinks: false

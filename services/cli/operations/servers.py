@@ -96,7 +96,7 @@ def _key_instructions(
 
 
 def search() -> None:
-    """Run a search worker (HOST, PORT) for the shard of all maps given by SEARCH_SHARD.
+    """Run a search worker for all maps (HOST, PORT).
 
     The worker follows the catalog at DATABASE_URL. It requires no key: allow access only from the
     gateway and the steward, which find it through SEARCH_URLS.

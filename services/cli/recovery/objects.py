@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from services.cli.recovery.journal_rows import ROWS_PER_STATEMENT, Progress, RecoveryReport
 from shared.catalog.batch_items import BatchItem
-from shared.catalog.chunks import Chunk, Descriptor, allocate_slot
+from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, RowType
 from shared.catalog.maps import get_or_create_default_map, increment_map_version
@@ -38,11 +38,7 @@ CHUNKS = "chunks/"
 
 
 def recover_chunks(
-    catalog: Catalog,
-    store: ObjectStore,
-    slot_rows: int,
-    recovered: RecoveryReport,
-    progress: Progress,
+    catalog: Catalog, store: ObjectStore, recovered: RecoveryReport, progress: Progress
 ) -> None:
     """Register the chunks with rows of photos that lack a descriptor in their generation.
 
@@ -69,7 +65,7 @@ def recover_chunks(
         elif manifest.generation_id not in states:
             recovered.unnamed_descriptors += len(manifest.photo_ids)
         elif states[manifest.generation_id] in (GenerationState.ACTIVE, GenerationState.BUILDING):
-            _recover_chunk(catalog, store, key, manifest, slot_rows, recovered)
+            _recover_chunk(catalog, store, key, manifest, recovered)
         progress("chunks", done, len(keys))
 
 
@@ -78,7 +74,6 @@ def _recover_chunk(
     store: ObjectStore,
     key: str,
     manifest: ChunkManifest,
-    slot_rows: int,
     recovered: RecoveryReport,
 ) -> None:
     with catalog.read() as session:
@@ -98,7 +93,6 @@ def _recover_chunk(
             Chunk(
                 id=manifest.chunk_id,
                 generation_id=generation.id,
-                slot=allocate_slot(generation, len(rows), slot_rows),
                 object_key=key,
                 rows=len(rows),
                 size_bytes=len(data),
@@ -107,14 +101,9 @@ def _recover_chunk(
             )
         )
         session.flush()
+        place = {"generation_id": generation.id, "chunk_id": manifest.chunk_id}
         descriptors = [
-            {
-                "generation_id": generation.id,
-                "photo_id": photo_id,
-                "chunk_id": manifest.chunk_id,
-                "row": row,
-            }
-            for photo_id, row in missing.items()
+            {**place, "photo_id": photo_id, "row": row} for photo_id, row in missing.items()
         ]
         session.execute(insert(Descriptor), descriptors)
         increment_map_version(session, generation.map_id)

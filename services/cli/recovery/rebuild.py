@@ -99,7 +99,7 @@ def rebuild_catalog(
     """Recover everything that the object store has, after `begin_rebuild`.
 
     Args:
-        settings: extractor of the default map, limits and slot size.
+        settings: extractor of the default map, and limits.
         with_unnamed: whether to add originals that are not in the journal to the default map.
 
     Raises:
@@ -109,7 +109,7 @@ def rebuild_catalog(
     with LatestStates() as states:
         states.read(store, progress)
         recover_rows(catalog, store, states, report, progress)
-        recover_chunks(catalog, store, settings.slot_rows, report, progress)
+        recover_chunks(catalog, store, report, progress)
         recover_snapshot(catalog, store, states, progress)
         if with_unnamed:
             unnamed = states.unnamed_originals()

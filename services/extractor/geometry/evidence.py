@@ -10,6 +10,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
+from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +47,24 @@ MAX_INDEPENDENT = 9
 """Positions of a block whose errors are independent, at most"""
 RAYLEIGH_MEDIAN = 1.1774
 """Median distance in two dimensions, in standard deviations"""
+NO_MATCHES = "No other photo shows the same"
+CONTRADICTED = (
+    "By their coordinates, some photos that look the same were taken elsewhere, and the others "
+    "share too few points with them"
+)
+UNCONNECTED = (
+    "They share too few points with the photos of a component, or are at another place in it than "
+    "by their coordinates"
+)
+
+
+def explain_left_out(photos: Sequence[PhotoToMap], matches: VerifiedMatches) -> dict[UUID, str]:
+    """Return why each photo would be in no component, as a sentence without its full stop."""
+    reasons = [NO_MATCHES] * len(matches.photo_ids)
+    for chosen, reason in ((..., UNCONNECTED), (~agreeing_pairs(photos, matches), CONTRADICTED)):
+        for number in matches.pairs[chosen].ravel().tolist():
+            reasons[number] = reason
+    return dict(zip(matches.photo_ids, reasons, strict=True))
 
 
 def agreeing_pairs(photos: Sequence[PhotoToMap], matches: VerifiedMatches) -> NDArray[np.bool_]:

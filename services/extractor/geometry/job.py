@@ -33,6 +33,7 @@ from services.extractor.geometry.calibrate import (
     calibrate_components,
     propose_coordinates,
 )
+from services.extractor.geometry.evidence import explain_left_out
 from services.extractor.geometry.mapping import (
     MappedComponent,
     PhotoToMap,
@@ -78,6 +79,9 @@ from shared.storage.keys import component_key, matches_key, reconstruction_prefi
 PROGRESS_UNITS = 100
 MATCHED, MAPPED = 40, 80  # units of progress after these steps
 MAX_NAMES_REPORTED = 100  # photos in no component, names of an imported model without a photo
+NOT_NAMED = "The imported model does not name them"
+OTHER_SHAPE = "Their camera has another shape than the photo, or EXIF mirrors it"
+ADDED_MEANWHILE = "They were added while the photos were matched"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,16 +118,28 @@ class ReconstructionJob:
         made = self._begin()
         photos = self._read_photos(made)
         result: dict[str, Any] = {"reconstruction_id": str(made.id), "photos": len(photos)}
-        model = None
+        model, of_map = None, photos
         if self._job.params["object_key"] is not None:
             model, unmatched = self._read_model(photos)
             names = model.names()
             photos = {id_: photo for id_, photo in photos.items() if str(id_) in names}
-            result |= _names_result("unmatched", unmatched)
+            result |= {
+                "unmatched": len(unmatched),
+                "unmatched_names": unmatched[:MAX_NAMES_REPORTED],
+            }
         matches = self._match(made, photos)
+        to_map = [
+            photo.to_map(position)
+            for photo, position in zip(photos.values(), _positions(photos.values()), strict=True)
+        ]
         components = self._load_components(made, photos)
         if components is None:
-            made, components = self._map(made, photos, matches, model)
+            made, components = self._map(made, photos, to_map, matches, model)
+        if model is None:
+            reasons = explain_left_out(to_map, matches)
+        else:
+            reasons = dict.fromkeys(of_map, NOT_NAMED) | dict.fromkeys(photos, OTHER_SHAPE)
+        result |= _left_out_result(of_map, components, reasons)
         origin = EastNorthUp(*model.origin) if model and model.origin else None
         self._finish(made, components, photos, result, origin)
 
@@ -254,14 +270,11 @@ class ReconstructionJob:
         self,
         made: Reconstruction,
         photos: dict[UUID, MapPhoto],
+        to_map: list[PhotoToMap],
         matches: VerifiedMatches,
         model: ColmapModel | None,
     ) -> tuple[Reconstruction, list[Component]]:
         """Reconstruct, and store the components."""
-        to_map = [
-            photo.to_map(position)
-            for photo, position in zip(photos.values(), _positions(photos.values()), strict=True)
-        ]
         known: dict[UUID, Rays] = {}
         self._progress.update(MATCHED, "map")
 
@@ -404,13 +417,7 @@ class ReconstructionJob:
             rows = [photos[id_].row for id_ in component.photo_ids]
             for each in propose_coordinates(component, alignment, *_coordinates(rows)):
                 proposals.append(_to_json(each, photos[each.photo].row))
-        left_out = photos.keys() - {id_ for each in components for id_ in each.photo_ids}
-        names = sorted(
-            photos[id_].row.relative_path or photos[id_].row.filename for id_ in left_out
-        )
         result |= {
-            "reconstructed": len(photos) - len(left_out),
-            **_names_result("left_out", names),
             "components": len(stored),
             "aligned": sum(each.alignment is not None for each in stored),
             "proposals": len(proposals),
@@ -532,9 +539,25 @@ def _to_json(proposal: CoordinateProposal, photo: Photo) -> dict[str, Any]:
     }
 
 
-def _names_result(what: str, names: list[str]) -> dict[str, Any]:
-    """Return the fields of a job's result for names of photos or of an imported model."""
-    return {what: len(names), f"{what}_names": names[:MAX_NAMES_REPORTED]}
+def _left_out_result(
+    photos: Mapping[UUID, MapPhoto], components: Sequence[Component], reasons: Mapping[UUID, str]
+) -> dict[str, Any]:
+    """Return the fields of a job's result for photos in no component."""
+    left_out = photos.keys() - {id_ for each in components for id_ in each.photo_ids}
+    listed = [
+        {
+            "image_id": str(id_),
+            "name": photos[id_].row.relative_path or photos[id_].row.filename,
+            "reason": reasons.get(id_, ADDED_MEANWHILE),
+        }
+        for id_ in left_out
+    ]
+    listed.sort(key=lambda each: each["name"])
+    return {
+        "reconstructed": len(photos) - len(listed),
+        "left_out": len(listed),
+        "left_out_photos": listed[:MAX_NAMES_REPORTED],
+    }
 
 
 def _join_matches(new: VerifiedMatches, known: VerifiedMatches) -> VerifiedMatches:

@@ -154,8 +154,8 @@ def livez() -> ProbeResponse:
 def readyz(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> ProbeResponse:
     """Readiness probe: 503 while a component that every request needs is unavailable.
 
-    Degraded components are ready: the other shards and chunks can be searched, and photos can be
-    deleted while the disk is full.
+    Degraded components are ready: the other chunks can be searched, and photos can be deleted while
+    the disk is full.
     """
     components = _check_components(gateway, admission)
     ready = all(component.status != "unhealthy" for component in components.values())
@@ -173,7 +173,7 @@ def readyz(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> 
 def read_health(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> HealthResponse:
     """Get the health of each component; 503 unless all are healthy.
 
-    `degraded`: chunks or shards can't be searched, photos can't be described, uploads are refused
+    `degraded`: chunks can't be searched, photos can't be described, uploads are refused
     because the disk or the job queue is full, Redis takes no messages, no steward is running, or
     orphans are not collected.
     """
@@ -264,8 +264,8 @@ def _check_search(gateway: GatewayContext) -> ComponentStatus:
     except PlacewiseError as error:
         return ComponentStatus(status="unhealthy", detail=error.detail)
     problems = []
-    if status.unavailable:
-        problems.append(f"no search worker is available for: {', '.join(status.unavailable)}")
+    if status.unwritten:
+        problems.append(f"{status.unwritten} chunks are still to be written to Milvus")
     if status.missing:
         named = ", ".join(status.missing[:MAX_NAMED_CHUNKS])
         more = len(status.missing) - MAX_NAMED_CHUNKS
@@ -281,7 +281,11 @@ def _check_search(gateway: GatewayContext) -> ComponentStatus:
         )
     if problems:
         return ComponentStatus(status="degraded", detail="; ".join(problems))
-    return ComponentStatus(status="healthy", detail=f"{status.rows} rows in memory")
+    place = "Milvus" if gateway.settings.search_engine == "milvus" else "memory"
+    detail = f"{status.rows} rows in {place}"
+    if status.recalls:
+        detail += f", recall of recent answers {min(status.recalls.values()):.3f}"
+    return ComponentStatus(status="healthy", detail=detail)
 
 
 def _check_messages(gateway: GatewayContext, depth: QueueDepth) -> QueueStatus:

@@ -219,8 +219,10 @@ def start_generation(
     with gateway.catalog.write() as session:
         map_id = get_map(session, query.map).id
         if body.pca is not None:
+            gateway.settings.check_row_length(body.pca)
             job = _queue_pca(session, map_id, body.pca, body.vocabulary_id)
         else:
+            gateway.settings.check_row_length(config.dimension if config else None)
             job = _queue_switch(session, map_id, config, body.vocabulary_id)
         accepted = idempotent.accept_job(session, job)
     gateway.wakeups.send(JobMessage.of(job, query.map))

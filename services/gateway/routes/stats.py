@@ -62,7 +62,7 @@ def read_stats(gateway: GatewayDep, query: MapQuery) -> StatsResponse:
             total_chunks=chunks,
             total_storage_bytes=int(chunk_bytes) + statistics.photo_bytes,
             feature_dimension=generation.dimension if generation else None,
-            max_images_per_chunk=gateway.settings.slot_rows,
+            max_images_per_chunk=gateway.settings.chunk_rows,
             extractor=generation.extractor if generation else map_.extractor,
             device=next(
                 (

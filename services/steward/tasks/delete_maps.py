@@ -44,7 +44,7 @@ from shared.storage.keys import ORIGINALS, derived_image_keys
 
 log = logging.getLogger(__name__)
 
-CHUNKS_PER_STEP = 50  # of up to SLOT_ROWS descriptors each
+CHUNKS_PER_STEP = 50  # of up to CHUNK_ROWS descriptors each
 SLICE_SECONDS = 2.0  # of one run, so that the steward's other tasks are not delayed
 
 

@@ -22,6 +22,7 @@ export class Problem extends Error {
 // What the page says instead of the API's details, which name its own ways.
 const WORDS = {
   scope_missing: ({ needed }) => `You may not do this: it requires the scope “${needed.join("”, “")}”. Get a key with it from an administrator${hasKey() ? ", and enter it after “Forget the key” on Status" : ""}.`,
+  reconstruction_running: () => "The map is being reconstructed already. Wait until that has ended, or cancel it.",
   model_change_running: () => "The model of this map is being changed. Wait until that has ended, or cancel it under Advanced.",
 };
 
@@ -144,4 +145,13 @@ export async function send(path, form, { query, key, onSent }) {
     if (problem.status !== 401) throw problem;
     await askForKey(problem);
   }
+}
+
+/** Save a file of the API under the name that the server gives it. */
+export async function download(path) {
+  const response = await ask(path);
+  const url = URL.createObjectURL(await response.blob());
+  const name = /filename="(.+)"/.exec(response.headers.get("Content-Disposition"))[1];
+  h("a", { href: url, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(url), 10_000);
 }

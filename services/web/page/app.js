@@ -22,13 +22,14 @@ const VIEWS = {
   photo: { title: "Photo", show: onDemand(() => import("./views/photo.js"), "showPhoto") },
   places: { title: "Places to give", show: onDemand(() => import("./views/places.js"), "showPlaces") },
   trash: { title: "Trash", show: onDemand(() => import("./views/trash.js"), "showTrash") },
+  reconstruction: { title: "Reconstruction", show: onDemand(() => import("./views/reconstruction.js"), "showReconstruction") },
   tracks: { title: "Tracks", show: onDemand(() => import("./views/tracks.js"), "showTracks") },
   add: { title: "Add", show: onDemand(() => import("./views/add.js"), "showAdd") },
   locate: { title: "Locate a folder", show: onDemand(() => import("./views/locate.js"), "showLocate") },
   model: { title: "Model", show: onDemand(() => import("./views/model.js"), "showModel") },
   status: { title: "Status", show: onDemand(() => import("./views/status.js"), "showStatus") },
 };
-const TAB_OF = { locate: "add", photo: "photos", places: "photos", trash: "photos", tracks: "model" };
+const TAB_OF = { locate: "add", photo: "photos", places: "photos", trash: "photos", reconstruction: "model", tracks: "model" };
 // Where to go from an address that names nothing.
 const LIST_OF = { photo: ["#/photos", "All photos"], tracks: ["#/tracks", "All tracks"], ask: ["#/ask", "Ask with a photo"] };
 const NEW_MAP = "\n"; // no map's name

@@ -47,7 +47,7 @@ let hints = 0;
 /** The views below *Advanced*, above each of them. */
 export function advancedTabs(current) {
   const link = (view, title) => h("a", { href: `#/${view}`, class: "button", "aria-current": view === current ? "page" : null }, title);
-  return h("nav", { class: "row subtabs", "aria-label": "Advanced" }, link("model", "Model"), link("tracks", "Tracks"));
+  return h("nav", { class: "row subtabs", "aria-label": "Advanced" }, link("model", "Model"), link("reconstruction", "Reconstruction"), link("tracks", "Tracks"));
 }
 
 /** A field with its label; the hint is no part of its name. */

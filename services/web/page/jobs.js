@@ -1,6 +1,8 @@
 // A job until it ends: server-sent events, or polling where a proxy keeps those back.
 
-import { ask, get } from "./api.js";
+import { ask, get, post } from "./api.js";
+import { bar, button, fill, h, note, noteError } from "./dom.js";
+import { percent } from "./format.js";
 
 const ENDED = ["succeeded", "failed", "cancelled"];
 const SILENCE_MS = 40_000; // the server sends a heartbeat every 15 s
@@ -64,7 +66,28 @@ export function stateInWords(job) {
   if (job.state === "queued" && job.waiting_for === "vocabulary") return "waits for a vocabulary";
   if (job.waiting_for === "disk_space") return "waits for disk space";
   if (job.state === "queued" && job.waiting_for) return `waits for ${job.waiting_for}`;
-  const stage = { sample: "looking at photos", cluster: "finding centres", gather: "reading descriptors", reduce: "computing the projection", describe: "describing", load: "loading into search", list: "listing", store: "storing" }[job.stage];
+  const stage = { sample: "looking at photos", cluster: "finding centres", gather: "reading descriptors", reduce: "computing the projection", describe: "describing", load: "loading into search", list: "listing", store: "storing", pairs: "choosing pairs", match: "matching photos", map: "computing the model", align: "aligning it", calibrate: "testing its poses" }[job.stage];
   if (job.state === "running") return stage ?? "being described";
   return { queued: "waiting", succeeded: "done", failed: "failed", cancelled: "cancelled" }[job.state];
+}
+
+/** The bar of a job in `work`; `again` draws the view anew when it has ended. */
+export async function followJob(work, started, words, again, signal) {
+  const state = h("p", { class: "soft" });
+  const progress = h("div", {});
+  const cancel = button("Cancel", () => post(`/jobs/${started.job_id}/cancel`));
+  fill(work, h("div", { class: "job" }, h("p", { role: "status" }, h("strong", {}, words)), progress, h("div", { class: "row" }, state, cancel)));
+  const draw = (job) => {
+    fill(progress, bar(words, job.progress.done, job.progress.total));
+    // Its stages count different things: a share says how far it is.
+    fill(state, stateInWords(job), job.state === "running" && job.progress.total ? `: ${percent(job.progress.done / job.progress.total)}` : "");
+  };
+  try {
+    const job = await watchJob(started.job_id, draw, signal);
+    if (job.state === "failed") note(job.error?.detail ?? `${words} has failed.`, "bad");
+    else note(`${words}: ${stateInWords(job)}.`);
+    await again();
+  } catch (error) {
+    if (!signal.aborted) noteError(error);
+  }
 }

@@ -28,7 +28,7 @@ def backend(
     if request.param == "in process":
         yield SearchWorker(catalog, store, settings)
     else:
-        with SearchTier(catalog, store, settings, (1, 1)) as tier:
+        with SearchTier(catalog, store, settings, 2) as tier:
             yield tier.port
 
 
@@ -110,8 +110,8 @@ def test_next_worker_matches_when_one_is_down_and_the_metrics_count_it(
 ) -> None:
     query, *others = put_features(store, scene_features(1), scene_features(1, view=0.5), None)
     request = MatchRequest(query=query, candidates=tuple(others))
-    with SearchTier(catalog, store, settings, (1, 1)) as tier:
-        (first,), (second,) = tier.servers
+    with SearchTier(catalog, store, settings, 2) as tier:
+        first, second = tier.servers
         second.stop()
         for _ in range(5):  # the order of the workers is random
             assert tier.port.match(request).candidates[0] is not None

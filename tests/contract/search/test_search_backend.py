@@ -45,12 +45,14 @@ class SearchPortContract:
 
     certificate = "exhaustive"
     """How the answers are reached."""
+    holds_rows = True
+    """Whether the worker itself holds the rows, and compares them."""
     length_error = 1e-6
     """Of the stored rows, which are unit vectors before they are rounded."""
 
     def test_order_and_scores_equal_brute_force(self, places: SmallMap, port: OpenPort) -> None:
         for seed, count in enumerate((1, 30, 7)):
-            places.add(unit_rows(seed, count), slot=seed // 2, dead=seed)
+            places.add(unit_rows(seed, count), dead=seed)
         search = port()
         for seed in range(5):
             vector = unit_rows(100 + seed, 1)[0]
@@ -122,7 +124,8 @@ class SearchPortContract:
                 vector = unit_rows(100 + k, 1)[0]
                 response = search.search(places.request(places.query(vector), k=k, **filters))
                 assert_answers(response, places.brute_force(vector, k, passing))
-                assert response.rows_scanned == len(passing)
+                if self.holds_rows:
+                    assert response.rows_scanned == len(passing)
                 certificate = self.certificate if passing else "exhaustive"
                 assert response.certificate == certificate
 
@@ -154,7 +157,7 @@ class SearchPortContract:
         reference = places.query(vector)
         search = port()
         search.search(places.request(reference))
-        for key in places.chunk_keys():
+        for key in places.chunk_keys() if self.holds_rows else ():
             places.store.delete(key)
 
         def found(**filters: Any) -> set[UUID]:
@@ -342,7 +345,10 @@ class SearchPortContract:
         status = search.status()
         assert status.rows == 3
         assert status.versions == {places.generation_id: places.version}
-        assert status.resident_bytes >= 5 * DIMENSION * np.dtype(places.row_type).itemsize
+        assert (
+            not self.holds_rows
+            or status.resident_bytes >= 5 * DIMENSION * np.dtype(places.row_type).itemsize
+        )
         assert status.missing == ()
 
     def test_queries_from_many_threads_are_exact_while_photos_come_and_go(

@@ -61,14 +61,14 @@ class AddDeleteMerge(RuleBasedStateMachine):
             self.catalog.close()
             shutil.rmtree(self.folder)
 
-    @rule(count=st.integers(1, 4), slot=st.integers(0, 1), dead=st.integers(0, 2))
-    def add(self, count: int, slot: int, dead: int) -> None:
+    @rule(count=st.integers(1, 4), dead=st.integers(0, 2))
+    def add(self, count: int, dead: int) -> None:
         self.seed += 1
-        self.places.add(unit_rows(self.seed, count), slot, dead)
+        self.places.add(unit_rows(self.seed, count), dead)
 
-    @rule(slot=st.integers(0, 1))
-    def add_duplicates(self, slot: int) -> None:
-        self.places.add(np.repeat(unit_rows(0, 1), 2, axis=0), slot)
+    @rule()
+    def add_duplicates(self) -> None:
+        self.places.add(np.repeat(unit_rows(0, 1), 2, axis=0))
 
     @rule(which=st.integers(0, 1000))
     def delete(self, which: int) -> None:
@@ -76,9 +76,9 @@ class AddDeleteMerge(RuleBasedStateMachine):
         photo_ids = sorted(self.places.rows)
         self.places.delete(photo_ids[which % len(photo_ids)])
 
-    @rule(slot=st.integers(0, 1))
-    def merge(self, slot: int) -> None:
-        assert self.places.merge(slot)
+    @rule()
+    def merge(self) -> None:
+        assert self.places.merge()
 
     @rule()
     def follow(self) -> None:

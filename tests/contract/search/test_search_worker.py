@@ -16,7 +16,6 @@ from services.search.worker import SearchWorker
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, RowType
 from shared.config.settings import Settings
-from shared.config.shards import SINGLE_SHARD
 from shared.errors import Unavailable
 from shared.search_api.protocol import SearchBackend
 from shared.storage import FolderStore, read_retries
@@ -163,7 +162,7 @@ def test_chunks_loaded_by_another_thread_during_a_sync_stay_loaded(
     (other,) = others
     both = {each.generation_id: each.version for each in (places, other)}
     assert worker.status().versions == both
-    cached = settings.search_cache_folder(SINGLE_SHARD)
+    cached = settings.search_cache_folder
     assert {folder.name for folder in cached.iterdir()} == set(map(str, both))
     with catalog.write() as session:
         session.get_one(Generation, other.generation_id).state = GenerationState.RETIRED
@@ -217,7 +216,7 @@ class TestSearchWorkerByCodes(TestSearchWorker):
         places.add(unit_rows(1, 30))
         vector = unit_rows(2, 1)[0]
         first = port().search(places.request(places.query(vector)))
-        (path,) = settings.search_cache_folder(SINGLE_SHARD).rglob("*.codes")
+        (path,) = settings.search_cache_folder.rglob("*.codes")
         whole = path.read_bytes()
         path.unlink()
         if damage != "gone":
@@ -230,8 +229,8 @@ class TestSearchWorkerByCodes(TestSearchWorker):
         self, places: SmallMap, port: OpenPort, settings: Settings
     ) -> None:
         places.add(unit_rows(1, 30))
-        settings.search_cache_folder(SINGLE_SHARD).parent.mkdir(parents=True, exist_ok=True)
-        settings.search_cache_folder(SINGLE_SHARD).write_text("no folder can be here")
+        settings.search_cache_folder.parent.mkdir(parents=True, exist_ok=True)
+        settings.search_cache_folder.write_text("no folder can be here")
         vector = unit_rows(2, 1)[0]
         response = port().search(places.request(places.query(vector)))
         assert_answers(response, places.brute_force(vector))

@@ -24,7 +24,7 @@ from tests.support.servers import start_postgres
 
 # Short, so that the jobs of a killed extractor are soon claimed again.
 SETTINGS = "LEASE_SECONDS=10\n"
-AT_WORK = ("search-0", "search-1", "gateway", "extractor", "extractor-2", "steward", "flower")
+AT_WORK = ("search", "gateway", "extractor", "extractor-2", "steward", "flower")
 PHOTOS = 24
 SECONDS = 240.0  # for work of seconds
 pytestmark = pytest.mark.timeout(1200)  # with the builds, on a busy machine
@@ -152,7 +152,7 @@ def test_api_servers_and_flower_require_their_passwords(machine: Machine) -> Non
             assert httpx2.get(machine.url("flower") + path, auth=wrong).status_code == 401, path
 
 
-def test_photo_is_described_and_found_in_both_shards(api: Caller) -> None:
+def test_photo_is_described_and_found(api: Caller) -> None:
     for job in [api.upload(number) for number in range(PHOTOS)]:
         api.succeeded(job)
     answer = api.search(5)
@@ -244,12 +244,9 @@ def test_embedded_image_describes_and_finds_a_photo(
 
 
 def test_services_notice_what_is_missing_and_end_in_time(machine: Machine) -> None:
-    machine.stop("search-1")
-    machine.wait_until_healthy("gateway")  # the other shard still answers
-    assert not machine.is_healthy("search-1")
     assert machine.stop("flower") == 0, machine.log("flower")  # without Redis, it takes longer
     machine.stop("redis")
     assert not machine.is_healthy("redis")
-    for service in ("gateway", "extractor", "search-0", "steward"):
+    for service in ("gateway", "extractor", "search", "steward"):
         assert machine.stop(service) == 0, machine.log(service)
         assert "Traceback" not in machine.log(service)

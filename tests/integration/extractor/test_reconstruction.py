@@ -112,7 +112,7 @@ def test_photos_are_reconstructed_aligned_to_their_coordinates_and_counted(walk:
         "photos": PHOTOS - 2,
         "reconstructed": PHOTOS - 2,
         "left_out": 0,
-        "left_out_names": [],
+        "left_out_photos": [],
         "components": 1,
         "aligned": 1,
         "proposals": 0,
@@ -147,40 +147,6 @@ def test_photos_are_reconstructed_aligned_to_their_coordinates_and_counted(walk:
     # The npz, and cameras, images, points, rigs and frames of COLMAP.
     assert report.checked["reconstruction"] == 6
     assert "reconstruction" not in {fault.what for fault in report.faults}
-
-
-def test_component_without_coordinates_says_why_it_is_not_aligned(walk: Walk) -> None:
-    with walk.service.catalog.write() as session:
-        for id_ in walk.ids[2:]:
-            photo = session.get_one(Photo, id_)
-            photo.latitude = photo.longitude = None
-    (component,) = walk.reconstruct().list_components()
-    assert component.alignment is None
-    assert component.not_aligned == "2 of its photos have coordinates, and 3 are needed."
-
-
-def test_photo_with_wrong_coordinates_gets_a_proposal_and_nothing_is_changed(
-    walk: Walk, service: Service
-) -> None:
-    with service.catalog.write() as session:
-        photo = session.get_one(Photo, walk.ids[2])
-        assert photo.latitude is not None
-        assert photo.longitude is not None
-        right, wrong = (
-            (photo.latitude, photo.longitude),
-            (photo.latitude + 0.001, photo.longitude),
-        )
-        photo.latitude, photo.longitude = wrong
-    made = walk.reconstruct()
-    (proposal,) = service.json("GET", f"/reconstructions/{made.id}/proposals")["proposals"]
-    assert proposal["image_id"] == str(walk.ids[2])
-    assert (proposal["latitude"], proposal["longitude"], proposal["accepted"]) == (*wrong, False)
-    proposed = proposal["proposed_latitude"], proposal["proposed_longitude"]
-    assert distance_m(*proposed, *right) < 0.3
-    assert 0 < proposal["radius_95_m"] < 1
-    assert proposal["distance_m"] == pytest.approx(111, abs=1)
-    unchanged = service.json("GET", f"/uploads/{walk.ids[2]}")
-    assert (unchanged["latitude"], unchanged["longitude"]) == wrong
 
 
 def test_later_run_registers_new_photos_with_what_is_known_of_the_others(

@@ -12,6 +12,7 @@ from services.extractor.fits import VocabularyFitRequest
 from services.steward.tasks.compaction import merge_small_chunks
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole
+from shared.config.settings import Settings
 from shared.jobs import JobKind, JobState
 from tests.integration.harness import FIT, Harness
 from tests.integration.in_process_api import Service
@@ -38,7 +39,7 @@ def test_a_query_keeps_its_descriptor_through_merging_and_a_model_change(vlads: 
     vlads.drain()
     assert vlads.searchable() == 4
     before = vlads.rows()
-    assert merge_small_chunks(vlads.catalog, vlads.store, compact_chunks=2) == 1
+    assert merge_small_chunks(vlads.catalog, vlads.store, Settings(), compact_chunks=2) == 1
     assert {photo_id: row.tolist() for photo_id, row in vlads.rows().items()} == {
         photo_id: row.tolist() for photo_id, row in before.items()
     }

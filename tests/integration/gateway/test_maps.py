@@ -340,7 +340,7 @@ def test_a_map_under_removal_is_not_compacted_reindexed_or_loaded(
     service.json("DELETE", "/maps/gone")
     service.search.sync()
     assert service.search.status().resident_bytes == 0
-    assert merge_small_chunks(catalog, store, compact_chunks=2) == 0
+    assert merge_small_chunks(catalog, store, settings, compact_chunks=2) == 0
     assert reindex_outdated_generations(catalog, ModelRegistry(store, settings, none_added)) == 0
     with catalog.read() as session:
         kinds = set(session.scalars(select(Job.kind)))

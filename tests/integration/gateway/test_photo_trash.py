@@ -7,7 +7,7 @@ from uuid import UUID
 import pytest
 from sqlalchemy import delete, update
 
-from services.steward.tasks.compaction import merge_slot, merge_small_chunks
+from services.steward.tasks.compaction import merge_small_chunks
 from services.steward.tasks.garbage_collection import collect_deleted_photos
 from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.chunks import Descriptor
@@ -15,8 +15,10 @@ from shared.catalog.database.base import db_now
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
 from shared.catalog.photos import Photo
+from shared.config.settings import Settings
 from shared.storage.keys import ORIGINALS, thumbnail_key
 from tests.integration.in_process_api import Service
+from tests.support.catalog_rows import merge_all
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
 
@@ -64,12 +66,12 @@ def test_a_merge_of_chunks_keeps_the_rows_of_removed_photos(service: Service) ->
     with service.catalog.read() as session:
         generation = active_generation(session, get_map(session, "default").id)
     assert generation
-    assert merge_slot(service.catalog, service.store, generation.id, 0)
+    assert merge_all(service.catalog, service.store, generation.id)
     assert found(service, 1) == [other]
     service.json("POST", f"/uploads/{photo}/restore")
     assert service.json("GET", f"/uploads/{photo}")["searchable"]
     assert found(service, 1) == [photo, other]
-    assert merge_small_chunks(service.catalog, service.store) == 0
+    assert merge_small_chunks(service.catalog, service.store, Settings()) == 0
 
 
 def test_a_restored_photo_that_lost_its_descriptor_is_described_again(service: Service) -> None:

@@ -186,7 +186,7 @@ def test_the_neighbours_of_a_best_photo_are_searched_once_in_an_unchanged_map(
 ) -> None:
     service.indexed(0, 1, place="hall")
     real = service.search.search
-    missing: tuple[str, ...] = ("shard 1/2",)
+    missing: tuple[str, ...] = ("chunks/a/b.npy",)
     requests: list[SearchRequest] = []
 
     def search(request: SearchRequest) -> SearchResponse:
@@ -199,7 +199,7 @@ def test_the_neighbours_of_a_best_photo_are_searched_once_in_an_unchanged_map(
         return len(requests)
 
     monkeypatch.setattr(service.search, "search", search)
-    assert [searches(), searches()] == [2, 2], "a ranking that lacks a shard is not cached"
+    assert [searches(), searches()] == [2, 2], "a ranking that lacks a chunk is not cached"
     missing = ()
     assert [searches(), searches()] == [2, 1]
     service.indexed(2, place="hall")

@@ -230,7 +230,6 @@ def test_enough_points_outweigh_that_coordinates_look_elsewhere(
         ("no reconstruction", "no reconstruction yet"),
         ("features of another model", "is of local features of xfeat@0123456789ab"),
         ("matching off", "`matching` is off"),
-        ("other place", "points of the model"),
         ("no texture", "too little texture"),
         ("search fails", "No search worker answers."),
         ("floor that the map lacks", "probably not in this map"),
@@ -254,8 +253,6 @@ def test_query_without_a_pose_is_answered_with_the_reason(
     elif case == "matching off":
         with service.catalog.write() as session:
             session.query(Map).one().matching = Matching.OFF
-    elif case == "other place":
-        features = scene_features(1)
     elif case == "no texture":
         features = LocalFeatures.empty((1280, 960), 64)
     elif case == "search fails":

@@ -363,7 +363,7 @@ def test_merged_chunks_give_each_photo_one_row(
 ) -> None:
     file_ids = [service.indexed(number)[0] for number in (1, 2, 3)]
     assert (
-        merge_small_chunks(service.catalog, store, compact_chunks=2) == 1
+        merge_small_chunks(service.catalog, store, settings, compact_chunks=2) == 1
     )  # the three lie there still
     file_ids += service.indexed(4)
     write_journal(service.catalog, store)

@@ -15,7 +15,6 @@ from sqlalchemy.exc import OperationalError
 from services.search import chunk_loader
 from shared.catalog.chunks import Chunk
 from shared.catalog.maps import Search
-from shared.config.shards import SINGLE_SHARD
 from shared.integrity.verify import repair_descriptors, verify_store
 from shared.jobs import InProcessWakeups
 from shared.storage import FolderStore, ObjectStore, read_retries
@@ -36,7 +35,7 @@ def store(request: pytest.FixtureRequest, tmp_path: Path) -> ObjectStore:
 
 def restarted(service: Service) -> Service:
     """The service as on a new machine: nothing is loaded, and nothing of a bucket is cached."""
-    shutil.rmtree(service.settings.search_cache_folder(SINGLE_SHARD), ignore_errors=True)
+    shutil.rmtree(service.settings.search_cache_folder, ignore_errors=True)
     again = Service(service.catalog, service.store, service.settings, service.make_worker)
     again.search.sync()
     return again

@@ -13,6 +13,7 @@ import pytest
 from services.steward.tasks.compaction import merge_small_chunks
 from services.steward.tasks.model_changes import advance_model_changes
 from shared.catalog.database.session import Catalog
+from shared.config.settings import Settings
 from shared.integrity.verify import verify_store
 from shared.jobs import InProcessWakeups
 from shared.storage import FolderStore
@@ -80,7 +81,7 @@ def test_uploads_are_searched_by_their_float16_rows_before_and_after_a_merge(
     best = result["similar_images"][0]
     assert best["image_id"] == photos[2], "a photo that is not stored, too"
     assert best["similarity_score"] == pytest.approx(1.0, abs=1e-4)
-    assert merge_small_chunks(service.catalog, store, compact_chunks=2) == 1
+    assert merge_small_chunks(service.catalog, store, Settings(), compact_chunks=2) == 1
     merged = rows_of(service)
     assert {row.dtype for row in merged.values()} == {np.dtype(np.float16)}
     assert all(np.array_equal(merged[photo_id], row) for photo_id, row in rows.items())

@@ -24,7 +24,6 @@ from shared.catalog.jobs import WaitingFor
 from shared.catalog.maps import Map
 from shared.catalog.processes import SEARCH_WORKER_TIMEOUT_SECONDS, RegisteredSearchWorker
 from shared.config.settings import Settings
-from shared.config.shards import Shard
 from shared.jobs import JobState
 from shared.search_api.protocol import SearchRequest
 from shared.storage import FolderStore, read_retries
@@ -75,8 +74,8 @@ Register = Callable[..., Registered]
 def register(catalog: Catalog, store: FolderStore, settings: Settings) -> Register:
     """A worker that is alive and has loaded what there is."""
 
-    def make(name: str, shard: str = "0/1", store: FolderStore = store) -> Registered:
-        worker = SearchWorker(catalog, store, settings, Shard.parse(shard))
+    def make(name: str, store: FolderStore = store) -> Registered:
+        worker = SearchWorker(catalog, store, settings)
         made = Registered(worker, WorkerHeartbeat(catalog, worker, name))
         made.presence.send_if_due()
         return made
@@ -286,18 +285,6 @@ def test_a_model_change_whose_chunks_are_damaged_again_and_again_fails(
     repair_generations(fitted.catalog, fitted.store)
     assert failure_code(fitted.job(job_id)) == "chunk_corrupt"
     assert fitted.active().id == old.id
-
-
-def test_a_switch_does_not_wait_for_a_shard_without_rows(
-    fitted: Harness, register: Register
-) -> None:
-    first = register("first", "0/2")  # every photo is in slot 0
-    register("second", "1/2")
-    job_id, new_id = complete(fitted)
-    assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH
-    first.catch_up()
-    fitted.advance()
-    assert fitted.active().id == new_id
 
 
 def test_a_photo_that_comes_while_search_loads_is_described_before_the_switch(

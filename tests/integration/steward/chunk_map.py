@@ -9,10 +9,11 @@ from uuid import UUID
 
 from sqlalchemy import select, update
 
-from services.steward.tasks.compaction import merge_slot, merge_small_chunks
+from services.steward.tasks.compaction import merge_small_chunks
 from shared.catalog.chunks import Descriptor, count_searchable, list_live_chunks
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import Map
+from shared.config.settings import Settings
 from shared.storage import FolderStore
 from shared.storage.chunks import features_key
 from shared.storage.feature_files import FeatureRows, read_feature_file
@@ -25,13 +26,14 @@ from tests.support.catalog_rows import (
     add_map,
     add_photo,
     delete,
+    merge_all,
     row_of,
     stored_rows,
 )
 
 HOUR_SECONDS = 3600.0
 DAY_SECONDS = 86_400.0
-MANY = 100  # chunks that an open slot may have before it is worth merging
+MANY = 100  # small chunks that there may be before it is worth merging
 
 
 Features = tuple[str, list[bytes]] | None
@@ -51,11 +53,11 @@ class ChunkMap:
         with self.catalog.write() as session:
             return [add_photo(session, self.map_id).id for _ in range(count)]
 
-    def chunks(self, *sizes: int, slot_rows: int = 1000) -> list[list[UUID]]:
+    def chunks(self, *sizes: int) -> list[list[UUID]]:
         """Publish chunks of these many photos; the photos of each."""
         made = [self.photos(size) for size in sizes]
         for photo_ids in made:
-            add_chunk(self.catalog, self.store, self.generation_id, photo_ids, slot_rows)
+            add_chunk(self.catalog, self.store, self.generation_id, photo_ids)
         return made
 
     def chunks_with_features(self, *features: Features) -> list[list[UUID]]:
@@ -81,17 +83,23 @@ class ChunkMap:
         for photo_id in photo_ids:
             delete(self.catalog, self.map_id, photo_id)
 
-    def merge(self, compact_chunks: int = MANY, retries: ReadRetries | None = None) -> int:
-        """One round of the steward's merging; how many slots it has merged."""
-        return merge_small_chunks(self.catalog, self.store, compact_chunks, retries)
+    def merge(
+        self,
+        compact_chunks: int = MANY,
+        retries: ReadRetries | None = None,
+        chunk_rows: int = 1000,
+    ) -> int:
+        """One round of the steward's merging; how many chunks it has written or dropped."""
+        settings = Settings(chunk_rows=chunk_rows)
+        return merge_small_chunks(self.catalog, self.store, settings, compact_chunks, retries)
 
-    def merge_slot(self) -> bool:
-        return merge_slot(self.catalog, self.store, self.generation_id, 0)
+    def merge_all(self) -> bool:
+        return merge_all(self.catalog, self.store, self.generation_id)
 
-    def live(self) -> list[tuple[int, int]]:
-        """(slot, rows) of the live chunks."""
+    def live(self) -> list[int]:
+        """The rows of each live chunk, oldest first."""
         with self.catalog.read() as session:
-            return [(c.slot, c.rows) for c in list_live_chunks(session, self.generation_id)]
+            return [chunk.rows for chunk in list_live_chunks(session, self.generation_id)]
 
     def check_rows(self, expected: list[UUID]) -> None:
         """The generation holds these photos, each with its own descriptor, and no others."""

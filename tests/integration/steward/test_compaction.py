@@ -1,4 +1,4 @@
-"""Compaction: small chunks of a slot are merged, whatever changes meanwhile."""
+"""Compaction: small chunks are merged, whatever changes meanwhile."""
 
 from __future__ import annotations
 
@@ -10,13 +10,16 @@ from typing import Any
 from uuid import UUID
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as some
 
 from services.steward.tasks import compaction
 from services.steward.tasks.garbage_collection import collect_deleted_photos
-from shared.catalog.chunks import Descriptor, count_searchable, list_live_chunks
+from shared.catalog.chunks import Chunk, Descriptor, count_searchable, list_live_chunks
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.photos import Photo
+from shared.ids import new_id
 from shared.storage.chunks import WrittenChunk, features_key, read_chunk, write_chunk
 from shared.storage.read_retries import ReadRetries
 from tests.integration.harness import same
@@ -26,14 +29,14 @@ from tests.support.catalog_rows import row_of, stored_rows
 pytestmark = pytest.mark.databases("postgresql")
 
 
-def test_small_chunks_of_an_open_slot_become_one_once_there_are_enough(chunk_map: ChunkMap) -> None:
+def test_new_chunks_become_one_once_there_are_enough(chunk_map: ChunkMap) -> None:
     photo_ids = sum_of(chunk_map.chunks(2, 3))
     assert chunk_map.merge(3) == 0
-    assert chunk_map.live() == [(0, 2), (0, 3)]
+    assert chunk_map.live() == [2, 3]
     photo_ids += sum_of(chunk_map.chunks(1))
     version = chunk_map.version()
     assert chunk_map.merge(3) == 1
-    assert chunk_map.live() == [(0, 6)]
+    assert chunk_map.live() == [6]
     chunk_map.check_rows(photo_ids)
     assert chunk_map.version() == version + 1  # search workers look again
     assert chunk_map.merge(3) == 0  # nothing is left to do
@@ -43,21 +46,36 @@ def sum_of(parts: list[list[UUID]]) -> list[UUID]:
     return [photo_id for part in parts for photo_id in part]
 
 
-def test_merging_stays_inside_a_slot_and_never_exceeds_its_rows(chunk_map: ChunkMap) -> None:
-    photo_ids = sum_of(chunk_map.chunks(3, 4, 3, 5, 5, 9, 1, slot_rows=10))
-    assert chunk_map.live() == [(0, 3), (0, 4), (0, 3), (1, 5), (1, 5), (2, 9), (2, 1)]
-    # The full slots alone: the open one (2) is no worse than it may be.
-    assert chunk_map.merge() == 2
-    assert chunk_map.live() == [(0, 10), (1, 10), (2, 9), (2, 1)]
+def test_merged_chunks_are_nearly_full_and_never_exceed_their_rows(chunk_map: ChunkMap) -> None:
+    photo_ids = sum_of(chunk_map.chunks(3, 4, 3, 5, 5, 9, 1, 2))
+    # The last two wait for more, and 9 rows are as good as full.
+    assert chunk_map.merge(chunk_rows=10) == 2
+    assert chunk_map.live() == [9, 1, 2, 10, 10]
     with chunk_map.catalog.read() as session:
         sealed = [chunk.sealed for chunk in list_live_chunks(session, chunk_map.generation_id)]
-    assert sealed == [True, True, False, False]
-    assert chunk_map.merge(2) == 1
-    assert chunk_map.live() == [(0, 10), (1, 10), (2, 10)]
+    assert sealed == [False, False, False, True, True]
+    assert chunk_map.merge(2, chunk_rows=10) == 1
+    assert chunk_map.live() == [9, 10, 10, 3]
+    assert chunk_map.merge(2, chunk_rows=10) == 0
     chunk_map.check_rows(photo_ids)
 
 
-def test_a_row_of_a_full_slot_was_merged_at_most_twice(
+@given(sizes=some.lists(some.integers(1, 20), max_size=80))
+def test_number_of_chunks_is_bounded_by_that_of_rows(sizes: list[int]) -> None:
+    chunks: list[Chunk] = []
+    for rows in sizes:
+        chunks.append(Chunk(id=new_id(), rows=rows, sealed=False))
+        while groups := compaction.group_chunks([c for c in chunks if c.rows < 12], 16, 4):
+            for group in groups:
+                assert len(group) > 1
+                merged = sum(chunk.rows for chunk in group)
+                assert merged <= 16
+                chunks = [chunk for chunk in chunks if chunk not in group]
+                chunks.append(Chunk(id=new_id(), rows=merged, sealed=True))
+    assert len(chunks) <= 2 * sum(sizes) / 16 + 4 * 4
+
+
+def test_a_row_is_merged_at_most_twice(
     chunk_map: ChunkMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written: Counter[UUID] = Counter()
@@ -69,14 +87,14 @@ def test_a_row_of_a_full_slot_was_merged_at_most_twice(
     monkeypatch.setattr(compaction, "write_chunk", count)
     photo_ids = []
     for _ in range(24):
-        photo_ids += sum_of(chunk_map.chunks(2, slot_rows=16))
-        chunk_map.merge(2)
+        photo_ids += sum_of(chunk_map.chunks(2))
+        chunk_map.merge(2, chunk_rows=16)
         assert len(chunk_map.live()) <= 3 + 4
     assert set(written.values()) <= {1, 2}
     chunk_map.check_rows(photo_ids)
 
 
-def test_an_open_slot_of_small_batches_has_a_bounded_number_of_chunks(chunk_map: ChunkMap) -> None:
+def test_small_batches_leave_a_bounded_number_of_chunks(chunk_map: ChunkMap) -> None:
     photo_ids = []
     for _ in range(40):
         photo_ids += sum_of(chunk_map.chunks(1))
@@ -87,12 +105,12 @@ def test_an_open_slot_of_small_batches_has_a_bounded_number_of_chunks(chunk_map:
 
 def test_rows_of_deleted_photos_are_dropped(chunk_map: ChunkMap) -> None:
     first, second = chunk_map.chunks(5, 5)
-    chunk_map.delete(first[0], first[4])
+    chunk_map.delete(first[0])
     assert chunk_map.merge() == 0  # a fifth is not worth it
-    chunk_map.delete(second[2])
+    chunk_map.delete(first[4])
     assert chunk_map.merge() == 1
-    assert chunk_map.live() == [(0, 7)]
-    chunk_map.check_rows([*first[1:4], *second[:2], *second[3:]])
+    assert chunk_map.live() == [5, 3]
+    chunk_map.check_rows([*first[1:4], *second])
 
 
 FEATURES = ("xfeat@1", [b"one", b"two"])
@@ -113,7 +131,7 @@ def test_local_features_are_merged_row_by_row_by_the_newest_model(
 ) -> None:
     photo_ids = sum_of(chunk_map.chunks_with_features(first, second))
     chunk_map.delete(photo_ids[0])
-    assert chunk_map.merge_slot()
+    assert chunk_map.merge_all()
     assert chunk_map.features() == merged
     chunk_map.check_rows(photo_ids[1:])
 
@@ -129,12 +147,12 @@ def test_damaged_local_features_are_dropped_and_the_rows_are_merged(
         chunk_map.store.put(key, chunk_map.store.get(key)[:-1] + b"x")
     else:
         chunk_map.store.delete(key)
-    assert chunk_map.merge_slot()
+    assert chunk_map.merge_all()
     assert chunk_map.features() == ("xfeat@1", [b"", b"", b"3", b"4"])
     chunk_map.check_rows(photo_ids)
 
 
-def test_a_slot_of_deleted_photos_is_left_without_a_chunk(chunk_map: ChunkMap) -> None:
+def test_a_chunk_of_deleted_photos_is_dropped(chunk_map: ChunkMap) -> None:
     (photo_ids,) = chunk_map.chunks(3)
     chunk_map.delete(*photo_ids)
     assert chunk_map.merge() == 1
@@ -149,7 +167,7 @@ def test_rows_that_no_photo_ever_had_are_dropped(chunk_map: ChunkMap) -> None:
         for photo_id in photo_ids[:2]:
             session.delete(session.get_one(Descriptor, (chunk_map.generation_id, photo_id)))
     assert chunk_map.merge() == 1
-    assert chunk_map.live() == [(0, 2)]
+    assert chunk_map.live() == [2]
     chunk_map.check_rows(photo_ids[2:])
 
 
@@ -168,9 +186,9 @@ def test_concurrent_compactions_merge_once(
         first_keys = {list_live_chunks(session, chunk_map.generation_id)[0].object_key}
     monkeypatch.setattr(compaction, "read_chunk", read_together)
     with ThreadPoolExecutor(2) as pool:
-        merges = [pool.submit(chunk_map.merge_slot) for _ in range(2)]
+        merges = [pool.submit(chunk_map.merge_all) for _ in range(2)]
         assert sorted(merge.result() for merge in merges) == [False, True]
-    assert chunk_map.live() == [(0, 5)]
+    assert chunk_map.live() == [5]
     chunk_map.check_rows(photo_ids)
 
 
@@ -201,12 +219,12 @@ def test_a_photo_deleted_while_merging_does_not_come_back(
 ) -> None:
     first, second = chunk_map.chunks(2, 3)
     while_merging(lambda: chunk_map.delete(first[0]))
-    assert chunk_map.merge_slot()
+    assert chunk_map.merge_all()
     with chunk_map.catalog.read() as session:
         assert count_searchable(session, chunk_map.generation_id) == 4
     rows = stored_rows(chunk_map.catalog, chunk_map.store, chunk_map.generation_id)
     assert all(same(row, row_of(photo_id)) for photo_id, row in rows.items())
-    assert chunk_map.merge_slot()
+    assert chunk_map.merge_all()
     chunk_map.check_rows([first[1], *second])
 
 
@@ -221,8 +239,8 @@ def test_a_photo_forgotten_while_merging_does_not_come_back(
         collect_deleted_photos(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
 
     while_merging(forget)
-    assert chunk_map.merge_slot()
-    assert chunk_map.live() == [(0, 5)]  # its row is dead
+    assert chunk_map.merge_all()
+    assert chunk_map.live() == [5]  # its row is dead
     chunk_map.check_rows([first[1], *second])
 
 
@@ -232,19 +250,21 @@ def test_a_chunk_that_arrives_while_merging_is_not_lost(
     first, second = chunk_map.chunks(2, 3)
     late: list[UUID] = []
     while_merging(lambda: late.extend(sum_of(chunk_map.chunks(2))))
-    assert chunk_map.merge_slot()
-    assert chunk_map.live() == [(0, 5), (0, 2)]
+    assert chunk_map.merge_all()
+    assert sorted(chunk_map.live()) == [2, 5]
     chunk_map.check_rows([*first, *second, *late])
 
 
 def test_a_corrupt_chunk_stays_and_others_are_merged(chunk_map: ChunkMap) -> None:
-    photo_ids = sum_of(chunk_map.chunks(5, 5, 3, 3, slot_rows=10))
+    photo_ids = sum_of(chunk_map.chunks(5, 5, 3, 3))
+    retries = ReadRetries()
     with chunk_map.catalog.read() as session:
         broken = list_live_chunks(session, chunk_map.generation_id)[0].object_key
     whole = chunk_map.store.get(broken)
     chunk_map.store.put(broken, whole[:-1] + bytes([whole[-1] ^ 1]))
-    assert chunk_map.merge(2) == 1
-    assert chunk_map.live() == [(0, 5), (0, 5), (1, 6)]
+    assert chunk_map.merge(2, retries) == 0
+    assert chunk_map.merge(2, retries) == 1
+    assert chunk_map.live() == [5, 11]
     chunk_map.store.put(broken, whole)
     chunk_map.check_rows(photo_ids)
 

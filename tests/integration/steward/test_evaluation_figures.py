@@ -9,7 +9,6 @@ from uuid import UUID
 import pytest
 import sqlalchemy as sql
 
-from services.steward.tasks.compaction import merge_slot
 from services.steward.tasks.garbage_collection import collect_superseded_chunks
 from shared.catalog.chunks import Descriptor
 from shared.catalog.database.session import Catalog
@@ -25,7 +24,7 @@ from shared.search_api.protocol import (
 )
 from tests.integration.evaluated_map import EvaluatedMap, Watched
 from tests.integration.steward.streets import HOUR, NOON, STREETS, WITHOUT_PLACE, at, query
-from tests.support.catalog_rows import delete, read_job
+from tests.support.catalog_rows import delete, merge_all, read_job
 
 
 def test_leave_one_out_recall_is_what_one_counts_by_hand(city: EvaluatedMap) -> None:
@@ -233,7 +232,7 @@ def test_chunks_merged_and_removed_meanwhile_change_no_figure(city: EvaluatedMap
     before = city.figures()["leave_one_out"]
 
     def merge() -> None:
-        assert merge_slot(city.catalog, city.store, city.generation_id, 0)
+        assert merge_all(city.catalog, city.store, city.generation_id)
         collect_superseded_chunks(city.catalog, city.store, grace_seconds=0)
         city.search.sync()
 

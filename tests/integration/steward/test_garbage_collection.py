@@ -47,7 +47,7 @@ pytestmark = pytest.mark.databases("postgresql")
 def test_superseded_chunks_go_after_the_grace_and_not_before(chunk_map: ChunkMap) -> None:
     photo_ids = sum_of(chunk_map.chunks(2, 3))
     old = chunk_map.objects("chunks/")
-    chunk_map.merge_slot()
+    chunk_map.merge_all()
     collect_superseded_chunks(chunk_map.catalog, chunk_map.store, HOUR_SECONDS)
     assert old < chunk_map.objects("chunks/")
     with chunk_map.catalog.write() as session:

@@ -44,7 +44,7 @@ pytestmark = pytest.mark.databases("postgresql")
 @pytest.mark.databases("sqlite", "postgresql")
 def test_concurrent_garbage_collections_are_safe(chunk_map: ChunkMap) -> None:
     retained = sum_of(chunk_map.chunks(2, 2))
-    chunk_map.merge_slot()
+    chunk_map.merge_all()
     gone = [
         upload(chunk_map.catalog, chunk_map.store, chunk_map.map_id, bytes([n]))[0]
         for n in range(6)
@@ -165,12 +165,12 @@ def test_the_loop_runs_each_task(
     stop = threading.Event()
 
     def stop_when_merged_and_collected() -> None:  # by the tasks that have a thread of their own
-        if chunk_map.live() == [(0, COMPACT_CHUNKS)] and not chunk_map.objects("originals/"):
+        if chunk_map.live() == [COMPACT_CHUNKS] and not chunk_map.objects("originals/"):
             stop.set()
 
     steward.tasks.append(PeriodicTask("stop", 0.0, stop_when_merged_and_collected))
     steward.run(stop)
-    assert chunk_map.live() == [(0, COMPACT_CHUNKS)]
+    assert chunk_map.live() == [COMPACT_CHUNKS]
     assert chunk_map.objects("originals/") == set()
     assert chunk_map.objects("incoming/") == set()
     assert wakeups.wait(0)

@@ -6,19 +6,23 @@
 4. a program from a package that the dev extra installs.
 
 Where none of them is there, the test fails and says how to get one.
+Milvus is always that of the package.
 
 Each server is started when a test first asks for it, and ends with the tests, also when those are
 killed. Those of 2 to 4 may be killed, stopped, started again and paused (`Handle`).
 """
 
+from tests.support.servers.milvus import MilvusServer, start_milvus
 from tests.support.servers.postgres import PostgresServer, start_postgres
 from tests.support.servers.redis import RedisServer, start_redis
 from tests.support.servers.s3 import S3Server, start_moto, start_s3
 
 __all__ = [
+    "MilvusServer",
     "PostgresServer",
     "RedisServer",
     "S3Server",
+    "start_milvus",
     "start_moto",
     "start_postgres",
     "start_redis",

@@ -6,11 +6,11 @@ import os
 from pathlib import Path
 
 import pytest
-from pydantic import SecretStr
+from pydantic import SecretStr, ValidationError
 
 from services.cli.environment import is_secret, read_settings
 from shared.config.settings import SECRET_SETTINGS, Settings
-from shared.errors import Misconfigured
+from shared.errors import Conflict, Misconfigured
 from shared.storage.s3 import Bucket
 
 
@@ -338,6 +338,7 @@ def test_every_secret_may_be_in_a_file(monkeypatch: pytest.MonkeyPatch, tmp_path
     secrets = {
         "ADMIN_KEY": "0123456789abcdef",
         "DATABASE_URL": "postgresql+psycopg://placewise:secret@db/placewise",
+        "MILVUS_URI": "http://user:secret@milvus:19530",
         "REDIS_URL": "redis://:secret@redis:6379/0",
         "S3_ACCESS_KEY": "placewise",
         "S3_SECRET_KEY": "secret",
@@ -381,3 +382,26 @@ def test_a_secret_file_that_cannot_be_read_or_is_ambiguous_is_refused(
     with pytest.raises(Misconfigured, match="both set") as error:
         read_settings()
     assert "another-key" not in error.value.detail
+
+
+def test_rows_that_milvus_can_not_hold_are_refused_with_what_helps() -> None:
+    on_milvus = Settings(search_engine="milvus", milvus_uri=SecretStr("http://milvus:19530"))
+    for allowed in (None, 8192, 32_768):
+        on_milvus.check_row_length(allowed)
+    Settings().check_row_length(98_304)
+    with pytest.raises(Conflict, match="placewise maps switch NAME --pca 8192") as refused:
+        on_milvus.check_row_length(98_304)
+    assert (refused.value.code, refused.value.extra) == ("rows_too_long", {"dimension": 98_304})
+
+
+@pytest.mark.parametrize(
+    "uri", ["http://milvus:19530", "https://user:secret@host:1", "https://token@host", "some.db"]
+)
+def test_a_milvus_uri_may_have_a_login(uri: str) -> None:
+    assert Settings(milvus_uri=SecretStr(uri)).milvus_uri == SecretStr(uri)
+
+
+def test_a_milvus_uri_that_is_none_is_refused_without_repeating_its_secret() -> None:
+    with pytest.raises(ValidationError) as refused:
+        Settings(milvus_uri=SecretStr("milvus:secret@19530"))
+    assert "secret" not in str(refused.value)

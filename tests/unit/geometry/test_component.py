@@ -81,21 +81,6 @@ def test_every_changed_byte_is_noticed_or_harmless(component: Component) -> None
             continue
 
 
-def test_component_without_photos_is_stored() -> None:
-    empty = Component(
-        (),
-        np.empty((0, 4)),
-        np.empty((0, 3)),
-        np.empty(0, np.int32),
-        (),
-        (),
-        np.empty((0, 3)),
-        np.empty((0, 3, 3), np.float32),
-        np.empty(0, np.int32),
-    )
-    assert Component.decode(empty.encode()).photo_ids == ()
-
-
 @pytest.mark.parametrize("vector", [(0, 0, 0), (3.14159, 0, 0), (0, -2, 2.4), (1e-9, 0, 0)])
 def test_quaternions_and_matrices_are_the_same_rotations(vector: tuple[float, ...]) -> None:
     rotation = rotation_of_vector(np.array(vector, float))

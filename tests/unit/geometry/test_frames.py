@@ -76,12 +76,14 @@ class Walk:
         headings = [rotation_of_vector(np.array([0, 0, -h])) for h in along]
         level = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # looks north
         self.rotations = [level @ h.T @ TURN for h in headings]
-        seen = self.enu + rng.normal(0, noise_m, self.enu.shape)
-        there = [self.plane.to_geographic(row) for row in seen]
+        self.locate(self.enu + rng.normal(0, noise_m, self.enu.shape))
+        self.sigmas = np.full(count, 5.0)
+
+    def locate(self, enu: np.ndarray) -> None:
+        there = [self.plane.to_geographic(row) for row in enu]
         self.latitudes = np.array([e.latitude for e in there])
         self.longitudes = np.array([e.longitude for e in there])
         self.altitudes = np.array([e.altitude_m for e in there])
-        self.sigmas = np.full(count, 5.0)
 
     def align(self) -> Alignment:
         return align(
@@ -145,10 +147,7 @@ def test_street_on_a_line_is_turned_about_it_as_upright_cameras_are() -> None:
     walk = Walk(PLACES["Turin"], noise_m=0.0)
     line = np.linspace(0, 150, len(walk.enu))[:, None] * [0.6, 0.8, 0.0] + [0, 0, 1.5]
     walk.enu, walk.centres = line, (line - (10, 20, 5)) @ TURN / walk.scale
-    places = [walk.plane.to_geographic(row) for row in line]
-    walk.latitudes = np.array([place.latitude for place in places])
-    walk.longitudes = np.array([place.longitude for place in places])
-    walk.altitudes = np.array([place.altitude_m for place in places])
+    walk.locate(line)
     found = walk.align()
     assert found.is_on_line
     aside = walk.centres[30] + 20 / walk.scale * TURN[2]  # 20 m above the street

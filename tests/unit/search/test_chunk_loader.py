@@ -223,7 +223,7 @@ def test_codes_and_rows_are_equal_in_memory_and_mapped(store: FolderStore, folde
     codes = loader.load_sign_codes(chunk.object_key, stored)
     stored = StoredChunk(stored.file, stored.rows, stored.sha256, codes)
     one = loaded(stored)
-    assert memory_parts([one, one]) == [("codes 0", 2 * 6 * 896), ("rows", 2 * 6 * 4 * DIMENSION)]
+    assert memory_parts([one, one]) == [2 * 6 * 896, 2 * 6 * 4 * DIMENSION]
     for parts in (0, 1, 2, 1, 0):
         one = hold_in_memory(one, parts)
         assert one.codes is not None

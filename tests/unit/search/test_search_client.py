@@ -1,11 +1,10 @@
-"""`HttpSearchClient` while its process stops."""
+"""`HttpSearchClient` while its process stops, and where a worker refuses."""
 
 from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
@@ -14,7 +13,6 @@ from shared.errors import Unavailable
 from shared.ids import new_id
 from shared.search_api.client import HttpSearchClient
 from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
-from tests.support.servers.handle import wait_until
 
 REQUEST = SearchRequest(
     generation_id=new_id(), object_key="queries/a.npy", row=0, min_version=0, k=1
@@ -25,14 +23,12 @@ RESPONSE = SearchResponse(
 
 
 class FakeWorker(ThreadingHTTPServer):
-    """A search worker of one shard that records the requests and answers when `released`."""
+    """A search worker that answers, or refuses."""
 
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
         self.status = SearchStatus(rows=0, resident_bytes=0, versions={}, missing=())
-        self.received: list[dict[str, object]] = []
-        self.released = threading.Event()
-        self.released.set()
+        self.refusal: Unavailable | None = None
 
     @property
     def url(self) -> str:
@@ -46,13 +42,15 @@ class _Handler(BaseHTTPRequestHandler):
         self._respond(self.server.status.model_dump_json())
 
     def do_POST(self) -> None:
-        body = self.rfile.read(int(self.headers["Content-Length"]))
-        self.server.received.append(json.loads(body))
-        self.server.released.wait(30)
-        self._respond(RESPONSE.model_dump_json())
+        self.rfile.read(int(self.headers["Content-Length"]))
+        refusal = self.server.refusal
+        if refusal is None:
+            self._respond(RESPONSE.model_dump_json())
+        else:
+            self._respond(json.dumps(refusal.as_problem()), refusal.status)
 
-    def _respond(self, body: str) -> None:
-        self.send_response(200)
+    def _respond(self, body: str, status: int = 200) -> None:
+        self.send_response(status)
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
         self.wfile.write(body.encode())
@@ -67,31 +65,22 @@ def worker() -> Iterator[FakeWorker]:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         yield server
-        server.released.set()
         server.shutdown()
         thread.join()
 
 
-def test_a_search_that_is_queued_or_begins_when_the_client_is_closed_is_unavailable(
-    worker: FakeWorker, monkeypatch: pytest.MonkeyPatch
+def test_a_search_that_begins_when_the_client_is_closed_is_unavailable(
+    worker: FakeWorker,
 ) -> None:
-    monkeypatch.setattr("shared.search_api.client.MAX_CONCURRENT_CALLS", 1)
-    worker.released.clear()
-    with ThreadPoolExecutor(3) as pool:
-        client = HttpSearchClient([worker.url], 2.0)
-        with client:
-            first = pool.submit(client.search, REQUEST)
-            wait_until(lambda: len(worker.received) == 1, 30, lambda: None, "the first call")
-            queued = pool.submit(client.search, REQUEST)
-            queue = client._call_executor._work_queue
-            wait_until(lambda: queue.qsize() == 1, 30, lambda: None, "the queued call")
-            threading.Timer(0.2, worker.released.set).start()
-        assert first.result() == RESPONSE
-        searches: list[Callable[[], SearchResponse]] = [
-            queued.result,
-            lambda: client.search(REQUEST),
-        ]
-        for search in searches:
-            with pytest.raises(Unavailable) as refused:
-                search()
-            assert refused.value.code == "search_unavailable"
+    with HttpSearchClient([worker.url], 2.0) as client:
+        assert client.search(REQUEST) == RESPONSE
+    with pytest.raises(Unavailable) as refused:
+        client.search(REQUEST)
+    assert refused.value.code == "search_unavailable"
+
+
+def test_engine_that_does_not_answer_is_reported_as_the_worker_does(worker: FakeWorker) -> None:
+    worker.refusal = Unavailable("engine_unavailable", "Milvus does not answer.")
+    with HttpSearchClient([worker.url], 2.0) as client, pytest.raises(Unavailable) as refused:
+        client.search(REQUEST)
+    assert refused.value.code == "engine_unavailable"

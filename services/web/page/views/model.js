@@ -1,9 +1,9 @@
 // How good the map's answers are, and what they are made with: vocabularies and model versions.
 
-import { ask, currentMap, get, post } from "../api.js";
-import { advancedTabs, bar, button, field, fill, h, note, noteError, openDialog, time } from "../dom.js";
+import { ask, currentMap, download, get, post } from "../api.js";
+import { advancedTabs, button, field, fill, h, note, noteError, openDialog, time } from "../dom.js";
 import { count, percent, plural } from "../format.js";
-import { stateInWords, watchJob } from "../jobs.js";
+import { followJob } from "../jobs.js";
 
 const CHANGES = { fit: "Improving the map", import_vocabulary: "Importing a vocabulary", switch: "Switching the vocabulary", pca: "Fitting a PCA" };
 const RECALLS = ["R@1", "R@5", "R@10"];
@@ -74,27 +74,6 @@ function elsewhereField(map, path) {
   const input = h("input", { type: "number", "aria-label": "Queries from elsewhere", min: 1, max: 99, required: true, value: Math.round(100 * map.elsewhere) });
   input.addEventListener("change", () => input.reportValidity() && ask(path, { method: "PATCH", json: { elsewhere: input.valueAsNumber / 100 } }).then(() => note("Saved."), noteError));
   return input;
-}
-
-/** The bar of a job that changes the model; `again` draws the view anew when it has ended. */
-async function followJob(work, started, words, again, signal) {
-  const state = h("p", { class: "soft" });
-  const progress = h("div", {});
-  const cancel = button("Cancel", () => post(`/jobs/${started.job_id}/cancel`));
-  fill(work, h("div", { class: "job" }, h("p", { role: "status" }, h("strong", {}, words)), progress, h("div", { class: "row" }, state, cancel)));
-  const draw = (job) => {
-    fill(progress, bar(words, job.progress.done, job.progress.total));
-    // Its stages count different things: a share says how far it is.
-    fill(state, stateInWords(job), job.state === "running" && job.progress.total ? `: ${percent(job.progress.done / job.progress.total)}` : "");
-  };
-  try {
-    const job = await watchJob(started.job_id, draw, signal);
-    if (job.state === "failed") note(job.error?.detail ?? `${words} has failed.`, "bad");
-    else note(`${words}: ${stateInWords(job)}.`);
-    await again();
-  } catch (error) {
-    if (!signal.aborted) noteError(error);
-  }
 }
 
 async function fitVocabulary(follow) {
@@ -181,7 +160,7 @@ function vocabulariesTable(vocabularies, generations, follow) {
         h("td", {}, nameVocabulary(one)), h("td", { class: "number wide-only" }, count(one.clusters)),
         h("td", { class: "wide-only" }, one.provenance.photos ? plural(Number(one.provenance.photos), "photo") : "–"), h("td", {}, time(one.created_at)),
         h("td", { class: "row end" },
-          button("Download", () => download(one)),
+          button("Download", () => download(`/vocabularies/${one.vocabulary_id}/file`)),
           active?.vocabulary_id === one.vocabulary_id && !active.pca_from ? h("span", { class: "chip own" }, "in use") : button("Switch to it", async () => follow(await post("/generations", { json: { vocabulary_id: one.vocabulary_id } }), CHANGES.switch)))))))));
 }
 
@@ -195,12 +174,4 @@ function modelsTable(models, map, follow) {
       h("tbody", {}, models.map((one) => h("tr", {},
         h("td", {}, one.extractor), h("td", {}, one.licence), h("td", {}, one.maps.join(", ")),
         h("td", { class: "row end" }, map.extractor === one.extractor ? h("span", { class: "chip own" }, "in use") : button("Switch to it", change(one.extractor)))))))));
-}
-
-async function download(vocabulary) {
-  const response = await ask(`/vocabularies/${vocabulary.vocabulary_id}/file`);
-  const url = URL.createObjectURL(await response.blob());
-  const name = /filename="(.+)"/.exec(response.headers.get("Content-Disposition") ?? "")?.[1] ?? "vocabulary.npz";
-  h("a", { href: url, download: name }).click();
-  setTimeout(() => URL.revokeObjectURL(url), 10_000);
 }

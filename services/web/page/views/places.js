@@ -4,13 +4,11 @@ import { get, post } from "../api.js";
 import { announce, bar, button, field, fill, h, note, noteError } from "../dom.js";
 import { fileChooser } from "../drop.js";
 import { count, metres, nameOf, percent, plural, whereabouts } from "../format.js";
-import { openMap } from "../map.js";
-import { thumbnail } from "../photo.js";
+import { acceptedList, proposalBoard, proposalCard } from "../proposals.js";
 import { readTrack } from "./locate.js";
 
 const PAGE = 10; // photos of one call: each is searched with
 const PER_CALL = 1000; // given at once, as the server allows
-const KNOWN_ON_MAP = 1000;
 const GIVEN_SHOWN = 48;
 
 /** A line with the number of photos without a place and the way to their proposals; nothing where all have one. */
@@ -54,35 +52,24 @@ export async function showPlaces(view, { signal }) {
   const together = h("input", { type: "checkbox" });
   const words = h("p", { class: "lead", role: "status" });
   const progress = h("div", {});
-  const ground = h("div", { class: "ground browse", hidden: true });
+  const board = proposalBoard("Before: the photos with a place. After: the proposals, by their numbers", signal);
   const tools = h("div", { class: "row" });
-  const grid = h("ul", { class: "proposals" });
   const rest = h("details", { class: "card", hidden: true });
   const given = h("section", { class: "card", hidden: true });
   let track = [];
   let proposals = [];
   let total = 0;
-  let map = null;
-  let known = [];
   let looking = null;
-  let after = true;
 
   const gpx = fileChooser({ accept: ".gpx", "data-use": "track" }, (files) => readTracks(files).catch(noteError));
   const options = h("details", { class: "card" }, h("summary", {}, "What else is known"), h("div", { class: "filters-more" },
     field("The photographer moved by", motion),
     h("div", { class: "field" }, h("span", {}, "GPX track"), button("Choose a GPX file", () => gpx.click()), gpx),
     h("label", { class: "check" }, together, h("span", {}, "The cameras travelled together"))));
-  const beforeButton = button("Show the map as it was before", () => {
-    after = !after;
-    beforeButton.setAttribute("aria-pressed", String(!after));
-    draw();
-  });
-  beforeButton.setAttribute("aria-pressed", "false");
-  beforeButton.hidden = true;
   const leastField = field("Accept from (%)", least);
   fill(view,
     h("header", { class: "head" }, h("h1", {}, "Places to give"), h("a", { class: "button", href: "#/photos" }, "All photos")),
-    words, progress, options, beforeButton, ground, h("div", { class: "proposal-tools", hidden: true }, leastField, tools), grid, rest, given);
+    words, progress, options, board.elements, h("div", { class: "proposal-tools", hidden: true }, leastField, tools), board.grid, rest, given);
   least.addEventListener("input", draw);
   for (const input of [motion, together]) input.addEventListener("change", () => start());
 
@@ -115,10 +102,10 @@ export async function showPlaces(view, { signal }) {
       proposals.push(...page.proposals);
       fill(progress, cursor && [h("p", { class: "soft" }, `Looking at ${count(proposals.length)} of ${plural(total, "photo")}`), bar("Looking for places", proposals.length, total)]);
       draw();
-      await drawMap();
+      await board.openMap();
     } while (cursor);
     announce(words.textContent);
-    map?.fit();
+    board.fit();
   }
 
   const isSure = (proposal) => placeOf(proposal) && surety(proposal) >= Number(least.value) / 100;
@@ -132,27 +119,21 @@ export async function showPlaces(view, { signal }) {
     fill(tools,
       sure.length > 0 && button(`Give ${plural(sure.length, "place")}`, () => give(sure), "primary"),
       button("None of them", () => forget(located)));
-    fill(grid, located.map((proposal, index) => h("li", {}, card(proposal, index + 1))));
+    board.draw(located.map((proposal) => ({
+      photo: proposal.photo, from: null, to: proposal.latitude === null ? null : [proposal.latitude, proposal.longitude], card: (number) => card(proposal, number),
+    })));
     rest.hidden = !unknown.length;
     fill(rest, h("summary", {}, `${plural(unknown.length, "photo")} without a proposal`),
       h("ul", { class: "unlocated" }, unknown.map(({ photo, reason, error }) => h("li", {}, h("a", { href: `#/photo/${photo.image_id}` }, nameOf(photo)), h("span", { class: "soft" }, ` ${error ?? reason}`)))));
-    if (map) drawPoints(located);
   }
 
   function card(proposal, number) {
     const { photo, looks_like: like, latitude, radius_m: radius, reason, place } = proposal;
-    const name = nameOf(photo);
-    return h("article", { class: isSure(proposal) ? "proposal sure" : "proposal" },
-      h("div", { class: "two-photos" },
-        h("figure", {}, h("a", { href: `#/photo/${photo.image_id}`, "aria-label": name }, thumbnail(photo, "")), h("figcaption", {}, name)),
-        like && h("figure", {}, h("a", { href: `#/photo/${like.image_id}`, "aria-label": `Looks like ${nameOf(like)}` }, thumbnail(like, "")), h("figcaption", {}, `Looks like ${nameOf(like)}`))),
-      h("p", { class: "match-words" }, h("span", { class: "rank-word" }, String(number)), h("span", { class: "figure" }, percent(surety(proposal))),
-        h("span", { class: "soft" }, latitude === null ? place : `within ${metres(radius)}`)),
-      h("p", { class: "soft small" }, `Before: no place. After: ${latitude === null ? place : whereabouts({ ...proposal, place: null })}`),
-      h("p", { class: "small" }, reason.charAt(0).toUpperCase() + reason.slice(1)),
-      h("div", { class: "row" },
-        button("Give this place", () => give([proposal])),
-        button("Not this", () => forget([proposal]), "link")));
+    return proposalCard(number, {
+      photo, like, reason, sure: isSure(proposal), before: "no place", after: latitude === null ? place : whereabouts({ ...proposal, place: null }),
+      certainty: [percent(surety(proposal)), latitude === null ? place : `within ${metres(radius)}`],
+      actions: [button("Give this place", () => give([proposal])), button("Not this", () => forget([proposal]), "link")],
+    });
   }
 
   /** Leave these photos as they are, until the next look. */
@@ -190,31 +171,8 @@ export async function showPlaces(view, { signal }) {
     given.hidden = found === 0;
     fill(given,
       h("header", { class: "head" }, h("h2", {}, `${plural(found, "place")} given or denied here`), button("Undo all", () => takeBack(null))),
-      h("ul", { class: "given" }, images.map((photo) => h("li", {},
-        h("a", { href: `#/photo/${photo.image_id}` }, thumbnail(photo, ""), h("span", {}, nameOf(photo))),
-        h("span", { class: "soft small" }, givenInWords(photo) ?? "got another place since"),
-        button("Undo", () => takeBack([photo.image_id]), "link")))),
+      acceptedList(images.map((photo) => [photo, givenInWords(photo) ?? "got another place since"]), (photos) => takeBack(photos.map(({ image_id: id }) => id))),
       found > images.length && h("p", { class: "soft" }, `The newest ${count(images.length)} are shown.`));
-  }
-
-  async function drawMap() {
-    const located = proposals.filter(({ latitude }) => latitude !== null);
-    if (!located.length || !ground.hidden) return;
-    ground.hidden = beforeButton.hidden = false;
-    const opened = await openMap(ground, "Before: the photos with a place. After: the proposals, by their numbers", { signal });
-    known = (await get("/search", { query: { box: "-90,-180,90,180", limit: KNOWN_ON_MAP }, signal })).images;
-    map = opened;
-    signal.throwIfAborted();
-    draw();
-    map.fit();
-  }
-
-  function drawPoints(located) {
-    map.clear();
-    for (const photo of known) map.point(photo.latitude, photo.longitude, { kind: "behind", radius: 4, text: nameOf(photo) });
-    if (after) located.map((proposal, index) => [proposal, index + 1]).reverse().forEach(([{ photo, latitude, longitude }, number]) => {
-      if (latitude !== null) map.numbered(latitude, longitude, number, `${number}: ${nameOf(photo)}`, () => grid.children[number - 1]?.scrollIntoView({ block: "center" }));
-    });
   }
 
   await drawGiven();

@@ -37,7 +37,7 @@ export function verdict(found, measurement, best) {
         h("dt", {}, "Compared"), h("dd", {}, `${count(found.rows_scanned)} rows, ${found.certificate}`),
         h("dt", {}, "Ranked by"), h("dd", {}, "similarity"),
         h("dt", {}, "Took"), h("dd", {}, `${found.processing_time_ms.toFixed(0)} ms`),
-        (found.no_pose ?? found.pose?.reason) && [h("dt", {}, "Pose"), h("dd", {}, found.no_pose ?? found.pose.reason)],
+        (found.no_pose ?? found.pose?.reason) && [h("dt", {}, "Pose"), h("dd", {}, found.no_pose ?? found.pose.reason, " ", h("a", { href: "#/reconstruction" }, "Reconstruction"))],
         h("dt", {}, "Vocabulary"), h("dd", {}, found.vocabulary))));
 }
 

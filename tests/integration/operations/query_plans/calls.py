@@ -24,7 +24,6 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.photos import Photo, PhotoRole, list_photos_changed_since
 from shared.catalog.processes import upsert_search_worker
 from shared.config.settings import Settings
-from shared.config.shards import SINGLE_SHARD
 from shared.errors import PlacewiseError
 from shared.ids import new_id
 from shared.jobs import InProcessWakeups, Job, JobKind, JobState
@@ -78,7 +77,7 @@ class _FakeSearch:
         return PoseResponse(reason="The query has too little texture to find points in it.")
 
     def status(self) -> SearchStatus:
-        return SearchStatus(shard="0/1", rows=0, resident_bytes=0, versions={}, missing=())
+        return SearchStatus(rows=0, resident_bytes=0, versions={}, missing=())
 
 
 def run_all_calls(
@@ -269,7 +268,7 @@ def _search_calls(
 
     def register() -> None:
         with catalog.write() as session:
-            upsert_search_worker(session, new_id(), "explained", None, SINGLE_SHARD, {})
+            upsert_search_worker(session, new_id(), "explained", {})
 
     def evaluate() -> None:
         with catalog.read() as session:

@@ -19,7 +19,7 @@ from shared.ids import new_id
 
 MAPS = 10
 LARGEST_MAP = "map-0"
-SLOT_ROWS = 1000
+CHUNK_ROWS = 1000
 WAITING_JOB_SHARE = 0.01  # share of photos just uploaded and not described yet
 
 # The n-th row of a kind, from 30 days ago until now.
@@ -69,20 +69,20 @@ FILL_STATEMENTS = {
         FROM numbers
     """,
     "chunks": """
-        INSERT INTO chunks (id, generation_id, slot, object_key, rows, size_bytes, sha256, sealed,
+        INSERT INTO chunks (id, generation_id, object_key, rows, size_bytes, sha256, sealed,
             created_at)
-        SELECT md5('chunk' || which || '/' || slot)::uuid, generation, slot,
-            'chunks/' || md5('chunk' || which || '/' || slot), count, count * 28672,
+        SELECT md5('chunk' || which || '/' || number)::uuid, generation,
+            'chunks/' || md5('chunk' || which || '/' || number), count, count * 28672,
             md5('') || md5(''), true, now()
         FROM (SELECT which, generations[which] AS generation,
-                     (place_in_map / :slot_rows)::int AS slot, count(*)::int AS count
-              FROM numbers WHERE NOT waits GROUP BY 1, 2, 3) AS slots
+                     (place_in_map / :chunk_rows)::int AS number, count(*)::int AS count
+              FROM numbers WHERE NOT waits GROUP BY 1, 2, 3) AS chunks
     """,
     "descriptors": """
         INSERT INTO descriptors (generation_id, photo_id, chunk_id, row)
         SELECT generations[which], photo_id,
-            md5('chunk' || which || '/' || (place_in_map / :slot_rows)::int)::uuid,
-            (place_in_map % :slot_rows)::int
+            md5('chunk' || which || '/' || (place_in_map / :chunk_rows)::int)::uuid,
+            (place_in_map % :chunk_rows)::int
         FROM numbers WHERE NOT waits
     """,
     "searches": """
@@ -132,7 +132,7 @@ def fill_catalog(catalog: Catalog, photos: int) -> SyntheticCatalog:
             "photos": photos,
             "maps": [str(map_id) for map_id in maps],
             "generations": [str(generation_id) for generation_id in generations],
-            "slot_rows": SLOT_ROWS,
+            "chunk_rows": CHUNK_ROWS,
             "waiting": WAITING_JOB_SHARE,
         }
         for statement in FILL_STATEMENTS.values():

@@ -7,7 +7,14 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from services.extractor.geometry.evidence import agreeing_pairs, find_misplaced
+from services.extractor.geometry.evidence import (
+    CONTRADICTED,
+    NO_MATCHES,
+    UNCONNECTED,
+    agreeing_pairs,
+    explain_left_out,
+    find_misplaced,
+)
 from services.extractor.geometry.mapping import PhotoToMap
 from services.extractor.geometry.matching import VerifiedMatches, match_pairs
 from shared.geometry.frames import rotation_of_vector
@@ -61,22 +68,23 @@ def test_matches_of_two_streets_that_look_alike_are_dropped(
     assert len(kept.pairs) == sum(1 for _ in combinations(range(PHOTOS // 2), 2)) * 2
 
 
+def test_photos_in_no_component_are_explained_by_their_matches(
+    scene: ReconstructedScene, matches: VerifiedMatches
+) -> None:
+    positions = 3 * scene.component.centres()
+    without_first = weaker_between_streets(matches).only(matches.pairs[:, 0] > 0)
+    for apart_m, expected in ((0.0, UNCONNECTED), (STREET_M, CONTRADICTED)):
+        positions[PHOTOS // 2 :, 1] += apart_m
+        reasons = explain_left_out(photos_at(scene, positions), without_first)
+        assert list(reasons.values()) == [NO_MATCHES, *[expected] * (PHOTOS - 1)]
+
+
 def test_photo_with_wrong_coordinates_keeps_its_matches(
     scene: ReconstructedScene, matches: VerifiedMatches
 ) -> None:
     positions = 3 * scene.component.centres()
     positions[4, 1] += STREET_M
     assert agreeing_pairs(photos_at(scene, positions), matches).all()
-
-
-def test_photos_without_coordinates_keep_their_matches(
-    scene: ReconstructedScene, matches: VerifiedMatches
-) -> None:
-    photos = [
-        PhotoToMap(p, f.width, f.height, f.pixels().astype(np.float32))
-        for p, f in scene.features.items()
-    ]
-    assert agreeing_pairs(photos, matches).all()
 
 
 class FoldedWalk:

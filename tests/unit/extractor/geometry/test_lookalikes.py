@@ -105,14 +105,6 @@ def test_coordinates_decide_whether_alike_photos_show_one_place(tmp_path: Path) 
     assert len(found.photo_ids) >= FIRST + SECOND - 2
 
 
-def test_photos_of_one_scene_are_no_lookalikes() -> None:
-    scene = ReconstructedScene(photos=12)
-    pairs = np.array([(i, j) for j in range(12) for i in range(j)], np.int32)
-    blocks, excess = find_lookalikes(scene.component, pairs, np.full(len(pairs), 50))
-    assert not blocks.any()
-    assert (excess >= 0).all()
-
-
 def test_photo_that_matches_others_elsewhere_is_a_block_of_its_own() -> None:
     scene = ReconstructedScene(photos=6)
     pairs = np.array([(i, j) for j in range(6) for i in range(j)], np.int32)

@@ -18,11 +18,10 @@ from services.extractor.geometry.mapping import (
 )
 from services.extractor.geometry.matching import VerifiedMatches, match_pairs
 from shared.errors import Unprocessable
-from shared.geometry.cameras import Camera, CameraSource, Rays
+from shared.geometry.cameras import Camera, Rays
 from shared.geometry.colmap_model import CAMERA_MODELS
 from shared.geometry.component import NO_POINT, Component
 from shared.geometry.frames import umeyama
-from shared.geometry.localise import localise
 from shared.matching.matchers import MutualNearest
 from tests.support.reconstructed_scene import ReconstructedScene
 
@@ -52,6 +51,13 @@ def position_errors(found: Component, scene: ReconstructedScene) -> np.ndarray:
 def only(components: list[MappedComponent]) -> MappedComponent:
     (found,) = components
     return found
+
+
+def map_all(
+    photos: list[PhotoToMap], matches: VerifiedMatches, folder: Path, *existing: Path
+) -> MappedComponent:
+    """Return the only component of the photos."""
+    return only(map_photos(photos, matches, folder, lambda _: None, lambda: None, existing))
 
 
 @pytest.fixture(scope="module")
@@ -106,30 +112,8 @@ def test_points_are_within_their_covariance(
 def test_photo_is_in_one_component_only(
     scene: ReconstructedScene, mapped: MappedComponent, tmp_path: Path
 ) -> None:
-    overlapping = [mapped.folder, mapped.folder]
-    found = only(
-        map_photos(*everything(scene), tmp_path, lambda _: None, lambda: None, overlapping)
-    )
+    found = map_all(*everything(scene), tmp_path, mapped.folder, mapped.folder)
     assert set(found.component.photo_ids) == set(scene.features)
-
-
-def test_photo_is_localised_in_a_reconstruction(
-    scene: ReconstructedScene, mapped: MappedComponent
-) -> None:
-    photo, features = scene.candidates[3]
-    pose = localise(
-        features,
-        scene.candidates,
-        [mapped.component],
-        None,
-        CameraSource.ESTIMATED,
-        MATCHER,
-        frozenset({photo}),
-    )
-    row = mapped.component.photo_ids.index(photo)
-    centres = mapped.component.centres()
-    unit = np.linalg.norm(centres[0] - centres[-1]) / 8  # of the scene
-    assert np.linalg.norm(pose.position - centres[row]) < 0.2 * unit
 
 
 def test_colmap_model_has_the_sizes_of_the_photos(mapped: MappedComponent) -> None:
@@ -149,11 +133,9 @@ def test_new_photos_are_registered_into_an_existing_model(
     photos, matches = everything(scene)
     for name in ("old", "new"):
         (tmp_path / name).mkdir()
-    old = only(map_photos(photos[:5], matches, tmp_path / "old", lambda _: None, lambda: None))
+    old = map_all(photos[:5], matches, tmp_path / "old")
     assert len(old.component.photo_ids) == 5
-    new = only(
-        map_photos(photos, matches, tmp_path / "new", lambda _: None, lambda: None, [old.folder])
-    )
+    new = map_all(photos, matches, tmp_path / "new", old.folder)
     assert set(new.component.photo_ids) == set(scene.features)
     assert position_errors(new.component, scene).max() < 0.1
 
@@ -191,7 +173,7 @@ def test_wrong_focal_length_of_exif_does_not_end_the_reconstruction(
 ) -> None:
     photos, matches = everything(scene)
     wrong = [replace(photo, focal_length=1.6) for photo in photos]  # it is 0.78
-    found = only(map_photos(wrong, matches, tmp_path, lambda _: None, lambda: None)).component
+    found = map_all(wrong, matches, tmp_path).component
     assert len(found.photo_ids) >= PHOTOS - 1
     assert position_errors(found, scene).max() < 0.3
     assert found.cameras[0].focal_pixels == pytest.approx(1000, rel=0.05)
@@ -203,7 +185,7 @@ def test_model_has_the_positions_of_its_photos_as_its_frame(
     photos, matches = everything(scene)
     truth = dict(zip(scene.component.photo_ids, scene.component.centres(), strict=True))
     placed = [replace(photo, position=10 * truth[photo.id] + (300, -200, 5)) for photo in photos]
-    found = only(map_photos(placed, matches, tmp_path, lambda _: None, lambda: None)).component
+    found = map_all(placed, matches, tmp_path).component
     expected = np.array([10 * truth[id_] + (300, -200, 5) for id_ in found.photo_ids])
     assert np.abs(found.centres() - expected).max() < 0.3
 

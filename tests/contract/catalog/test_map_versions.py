@@ -1,4 +1,4 @@
-"""Map versions, default map, model registry, deleted photos and slots, on both databases."""
+"""Map versions, default map, model registry and deleted photos, on both databases."""
 
 from __future__ import annotations
 
@@ -8,15 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 from uuid import UUID
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as some
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from services.gateway.photo_search import MetadataFilter, search_photos
-from shared.catalog.chunks import allocate_slot
 from shared.catalog.database.session import Catalog
-from shared.catalog.generations import Generation
 from shared.catalog.maps import Map, get_or_create_default_map, increment_map_version
 from shared.catalog.models import Model, get_or_create_model
 from shared.catalog.photos import (
@@ -98,20 +94,3 @@ def test_a_deleted_photo_and_one_of_another_map_show_in_no_query(
         changed = list_photos_changed_since(session, map_id, version)
         assert [(facts.photo_id, facts.findable) for facts in changed] == [(goes, False)]
         assert list_photos_changed_since(session, map_id, version + 1) == []
-
-
-@given(data=some.data(), slot_rows=some.integers(2, 60))
-def test_take_slot_never_lets_a_slot_exceed_its_rows(data: some.DataObject, slot_rows: int) -> None:
-    batches = data.draw(some.lists(some.integers(1, slot_rows), max_size=40))
-    generation = Generation(open_slot=0, open_slot_rows=0)
-    held: dict[int, int] = {}
-    slots = []
-    for rows in batches:
-        slot = allocate_slot(generation, rows, slot_rows)
-        held[slot] = held.get(slot, 0) + rows
-        slots.append(slot)
-    assert all(rows <= slot_rows for rows in held.values())
-    assert slots == sorted(slots)  # a slot that was left is never opened again
-    assert sorted(held) == list(range(len(held)))
-    if held:
-        assert generation.open_slot_rows == held[generation.open_slot]
