@@ -328,8 +328,7 @@ def compare(
     protocol: ProtocolOption = None,
     rule: RuleOption = None,
     out: Annotated[
-        Path | None,
-        typer.Option(help="Output folder for table.csv, table.tex and a figure of recall@k."),
+        Path | None, typer.Option(help="DIR: output folder for table.csv, table.tex and a figure.")
     ] = None,
     faiss_gpu: FaissGpuOption = False,
     extractor: Annotated[
@@ -344,10 +343,7 @@ def compare(
         int, typer.Option("--photos", min=20, help="Map: number of photos that are described.")
     ] = 1000,
     weights: Annotated[
-        bool,
-        typer.Option(
-            "--weights", help="Map: choose the weights of each A+B on the map's own photos."
-        ),
+        bool, typer.Option("--weights", help="Map: choose the weights of each A+B on its photos.")
     ] = False,
     map_name: MapOption = None,
     as_json: JsonOption = False,
@@ -360,6 +356,8 @@ def compare(
     if data is None:
         from lab.cli.evaluation.compare_on_map import compare_on_map
 
+        options = {"--set": set_name, "--protocol": protocol, "--rule": rule, "--out": out}
+        _reject_options("without DIR", {"--extractors": extractors, **options})
         compare_on_map(map_name, extractor, photos, weights, as_json)
         return
     if extractors is None:

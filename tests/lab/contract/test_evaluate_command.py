@@ -198,6 +198,7 @@ def test_an_evaluation_writes_figures_rankings_and_a_report_that_fetches_nothing
     assert "Levels of places" in text
     of_a_map = ["--data", city, "--extractor", "test-tiny-avg", "--map", "town"]
     assert run_json("evaluate", *of_a_map, code=1)["code"] == "options_contradict"
+    assert run_json("compare", "--out", tmp_path, code=1)["code"] == "options_contradict"
 
 
 def test_a_ground_truth_file_replaces_that_of_a_set(
