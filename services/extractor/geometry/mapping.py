@@ -51,6 +51,10 @@ DISTORTION_VECTORS = (("p2", "p1"), ("sx1", "sy1"), ("p0", "p1"), ("s0", "s2"), 
 """Parameters of camera models that are the x and y of a vector in the plane of the photo"""
 
 
+Judged = tuple[Any, set[str], NDArray[np.bool_]]
+"""A model of pycolmap with its misplaced photos and the matches that led there"""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotoToMap:
     """What the reconstruction needs of a photo."""
@@ -225,12 +229,17 @@ def _map(
             rest -= set(_names(found[-1]))
         databases = (Path(scratch) / f"{number}.db" for number in itertools.count())
 
-        def attempt(tried: Sequence[PhotoToMap], is_known: bool, names: set[str]) -> list[Any]:
+        judge = partial(misplaced_photos, photos=photos, matches=matches, is_used=is_used)
+
+        def attempt(tried: Sequence[PhotoToMap], is_known: bool, names: set[str]) -> list[Judged]:
             path = next(databases)
             _write_database(pycolmap, tried, matches.only(is_used), path, models)
-            return run(path, "", names, is_known)
+            made = run(path, "", names, is_known)
+            for each in made:
+                adjust_to_positions(pycolmap, each, photos)
+            return [(each, *judge(_component_of(each, by_name))) for each in made]
 
-        anew: list[Any] = []
+        anew: list[Judged] = []
         for cuts in range(MAX_CUTS + 1):
             if len(rest) < MIN_MODEL_PHOTOS:
                 break
@@ -239,41 +248,43 @@ def _map(
                 # A wrong focal length in EXIF leaves no pair to begin with.
                 blind = [replace(photo, trusts_focal_length=False) for photo in photos]
                 for is_known in (False, True):
-                    anew = max(anew, attempt(blind, is_known, rest), key=_registered)
+                    anew = max(anew, attempt(blind, is_known, rest), key=count_joined)
             if not models and MIN_FOCAL_PHOTOS <= _largest(anew) < ENOUGH_SHARE * len(rest):
                 # Small components can't tell their focal length: they get that of the largest one.
-                again = attempt(_with_cameras_of(anew[0], photos), True, rest)
-                anew = max(anew, again, key=_registered)
-            for each in anew:
-                adjust_to_positions(pycolmap, each, photos)
-            judge = partial(misplaced_photos, photos=photos, matches=matches, is_used=is_used)
-            judged = [judge(_component_of(each, by_name)) for each in anew]
-            wrong = np.any([contradicts for _, contradicts in judged], axis=0)
+                again = attempt(_with_cameras_of(anew[0][0], photos), True, rest)
+                anew = max(anew, again, key=count_joined)
+            wrong = np.any([contradicts for *_, contradicts in anew], axis=0)
             if cuts == MAX_CUTS or not wrong.any():
-                for each, (misplaced, _) in zip(anew, judged, strict=True):
+                for each, misplaced, _ in anew:
                     while misplaced:  # without these, others may have nothing that holds them
                         _deregister(each, misplaced)
                         misplaced, _ = judge(_component_of(each, by_name))
                 break
             is_used &= ~wrong
-        plausible = [each for each in anew if _bent_focal_length(each) is None]
+        plausible = [each for each, *_ in anew if _bent_focal_length(each) is None]
         if anew and not found and not plausible:
             raise Unprocessable(
                 "empty_model",
                 "No photos could be reconstructed together: their matches agree with a focal "
-                f"length of {_bent_focal_length(anew[0]):.2f} longer sides only, which hardly a "
+                f"length of {_bent_focal_length(anew[0][0]):.2f} longer sides only, which hardly a "
                 "camera has. Send photos as the camera took them, neither cropped nor with a "
                 "changed perspective.",
             )
         return _write_models(photos, found + plausible, folder)
 
 
-def _registered(models: Sequence[Any]) -> int:
-    return sum(model.num_reg_images() for model in models)
+def count_joined(made: Sequence[Judged]) -> int:
+    """Return how many pairs of photos are in one model, each in the first that has it in place."""
+    taken, found = set[str](), 0
+    for model, misplaced, _ in made:
+        names = set(_names(model)) - misplaced - taken
+        taken |= names
+        found += len(names) ** 2
+    return found
 
 
-def _largest(models: Sequence[Any]) -> int:
-    return max((model.num_reg_images() for model in models), default=0)
+def _largest(made: Sequence[Judged]) -> int:
+    return max((model.num_reg_images() for model, *_ in made), default=0)
 
 
 def _pipeline_options(pycolmap: Any, is_focal_length_known: bool) -> Any:

@@ -106,7 +106,8 @@ def start_reconstruction(
 
     Each component, photos that were reconstructed together, is aligned to the coordinates of its
     photos. Queries with `pose=true` then have a pose. The job's `result` counts photos and
-    components; a job that is interrupted continues from its last step.
+    components, and lists photos in no component with the reasons (`left_out_photos`). A job that is
+    interrupted continues from its last step.
     """
     from_scratch = options is not None and options.from_scratch
     return _queue(

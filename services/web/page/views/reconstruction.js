@@ -91,8 +91,8 @@ function alignmentInWords({ not_aligned: reason, located, agreeing, alignment_rm
 }
 
 /** The photos in no component, by the reason. */
-function leftOut({ left_out: total, left_out_photos: photos }) {
-  if (!total) return null;
+function leftOut({ left_out: total, left_out_photos: photos = [] }) {
+  if (!photos.length) return null;
   const reasons = [...new Set(photos.map(({ reason }) => reason))];
   return h("details", { class: "card", open: true }, h("summary", {}, `${plural(total, "photo")} left out`),
     reasons.map((reason) => h("div", {}, h("p", {}, `${reason}:`),

@@ -10,8 +10,10 @@ import pycolmap
 import pytest
 
 from services.extractor.geometry.mapping import (
+    Judged,
     MappedComponent,
     PhotoToMap,
+    count_joined,
     import_model,
     map_photos,
     turned_camera,
@@ -269,3 +271,20 @@ def test_photos_without_matches_are_refused(tmp_path: Path) -> None:
     none = VerifiedMatches(tuple(p.id for p in photos), np.empty((0, 2), np.int32), ())
     with pytest.raises(Unprocessable, match="too few matches"):
         map_photos(photos, none, tmp_path, lambda _: None, lambda: None)
+
+
+def test_one_model_joins_more_photos_than_several_that_overlap_unless_it_misplaces_them() -> None:
+    def judged(rows: range, *misplaced: str) -> Judged:
+        model = pycolmap.Reconstruction()
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera.create_from_model_name(1, "PINHOLE", 500.0, 640, 480)
+        )
+        for row in rows:
+            image = pycolmap.Image(name=str(row), camera_id=1, image_id=row + 1)
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+        return model, set(misplaced), np.zeros(0, dtype=bool)
+
+    parts = [judged(range(6)), judged(range(5, 10)), judged(range(3))]
+    for misplaced, is_better in (((), True), (("6", "7", "8"), False)):
+        whole = [judged(range(9), *misplaced)]
+        assert (count_joined(whole) > count_joined(parts)) == is_better
