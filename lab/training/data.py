@@ -173,6 +173,14 @@ class PlaceBatchSampler:
                 for place in order[first : first + self.places_per_batch]
             ]
 
+    def step_batches(self, steps: range) -> Iterator[list[PlaceSample]]:
+        """Yield the batches of consecutive steps, counted through all epochs."""
+        while steps:
+            epoch, start = divmod(steps[0], len(self))
+            for _, batch in zip(steps, self.batches(epoch, start), strict=False):
+                yield batch
+            steps = steps[len(self) - start :]
+
     def order(self, epoch: int) -> NDArray[np.int64]:
         """Return the indices of all places in the order of the epoch, (places,) int64."""
         interval = self.reshuffle_every_epochs
@@ -254,12 +262,12 @@ class PlaceDataset(Dataset[Batch]):
         *,
         fail_on_undecodable: bool,
     ) -> None:
-        self._places = sampler.places
+        self.sampler = sampler
         self._transform = transform
         self._fail_on_undecodable = fail_on_undecodable
 
     def __getitem__(self, sample: PlaceSample) -> Batch:
-        place = self._places[sample.place]
+        place = self.sampler.places[sample.place]
         photos: list[Tensor] = []
         undecodable: list[tuple[str, str]] = []
         for position, index in enumerate(sample.photos):
@@ -295,22 +303,16 @@ def _join(parts: list[Batch]) -> Batch:
 PART_PLACES = 8  # of a batch, which a worker loads: the first batch is made by several
 
 
-def load_batches(
-    sampler: PlaceBatchSampler,
-    dataset: PlaceDataset,
-    epoch: int = 0,
-    start: int = 0,
-    *,
-    num_workers: int,
-) -> Iterator[Batch]:
-    """Load the epoch's batches, beginning with batch number `start`; workers read two ahead."""
+def load_batches(dataset: PlaceDataset, steps: range, *, num_workers: int) -> Iterator[Batch]:
+    """Load the batches of the steps; workers read two ahead, also into the next epoch."""
+    sampler = dataset.sampler
     parts_of_batch = -(-sampler.places_per_batch // PART_PLACES)
     parts = iter(
         DataLoader(
             dataset,
             batch_sampler=(
                 batch[first : first + PART_PLACES]
-                for batch in sampler.batches(epoch, start)
+                for batch in sampler.step_batches(steps)
                 for first in range(0, len(batch), PART_PLACES)
             ),
             num_workers=num_workers,
@@ -320,7 +322,7 @@ def load_batches(
             generator=torch.Generator(),  # else it would draw from the training's global generator
         )
     )
-    for batch in sampler.batches(epoch, start):
+    for batch in sampler.step_batches(steps):
         yield _join([next(parts) for _ in range(0, len(batch), PART_PLACES)])
 
 

@@ -192,8 +192,9 @@ class TrainingLoop:
         Raises RunStopped after a requested stop (`last.ckpt` holds the state after the last step),
         Unprocessable (`no_photo_decodes`, `loss_not_finite`), and what validation raises.
         """
+        batches = self._load_batches()
         while self.completed_steps < self._last_step:
-            self._train_epoch(loggers)
+            self._train_epoch(loggers, batches)
         for logger in loggers:
             logger.finalize("success")
 
@@ -202,9 +203,9 @@ class TrainingLoop:
         self._network.train()
         self._train_step(next(self._load_batches()))
 
-    def _train_epoch(self, loggers: Sequence[Logger]) -> None:
+    def _train_epoch(self, loggers: Sequence[Logger], batches: Iterator[Batch]) -> None:
         """Train the rest of the current epoch."""
-        history, batches = self._run.history, self._load_batches()
+        history = self._run.history
         # Set in each epoch: validation is in float32.
         torch.backends.cudnn.allow_tf32 = is_tf32 = self._arguments.precision != "32-true"
         torch.set_float32_matmul_precision("high" if is_tf32 else "highest")
@@ -236,14 +237,8 @@ class TrainingLoop:
                 return
 
     def _load_batches(self) -> Iterator[Batch]:
-        epoch, start = divmod(self.completed_steps, len(self._sampler))
-        return load_batches(
-            self._sampler,
-            self._dataset,
-            epoch,
-            start,
-            num_workers=self._arguments.num_workers,
-        )
+        steps = range(self.completed_steps, self._last_step)
+        return load_batches(self._dataset, steps, num_workers=self._arguments.num_workers)
 
     def _train_step(self, batch: Batch) -> dict[str, float]:
         """Train on a batch, and return the metrics of the step."""

@@ -175,7 +175,7 @@ def _photo_object_keys(catalog: Catalog, jobs: list[Job]) -> dict[UUID, str]:
     """Return the object key of each job's photo; deleted photos are left out."""
     if jobs[0].kind == JobKind.DESCRIBE:
         return {job.id: query_key(job.id) for job in jobs}
-    with catalog.read() as session:
+    with catalog.read_once() as session:
         found = session.execute(
             select(Job.id, Photo.object_key)
             .join(Photo, Photo.id == Job.photo_id)

@@ -28,7 +28,7 @@ from shared.catalog.database.base import db_now
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, active_generation
 from shared.catalog.jobs import WaitingFor
-from shared.catalog.maps import Map, increment_map_version, lock_map
+from shared.catalog.maps import Map, Matching, increment_map_version, lock_map
 from shared.catalog.vocabularies import VocabularyOrigin, add_vocabulary
 from shared.descriptors.extractor import Extractor, spec_fingerprint
 from shared.descriptors.vocabulary import encode_centres
@@ -49,6 +49,8 @@ class ResolvedGeneration(DescriptorPipeline):
     """A generation with the pipeline that computes its descriptors."""
 
     generation: Generation
+    matching: Matching
+    """That of the map."""
 
 
 def resolve_generation(context: ExtractorContext, job: Job) -> ResolvedGeneration | None:
@@ -66,15 +68,19 @@ def resolve_generation(context: ExtractorContext, job: Job) -> ResolvedGeneratio
             generation = session.get(Generation, job.generation_id)
         else:
             generation = active_generation(session, job.map_id)
-        map_extractor = session.get_one(Map, job.map_id).extractor
+        map_ = session.get_one(Map, job.map_id)
     if generation is None:
-        extractor = context.models.extractor(map_extractor)
+        extractor = context.models.extractor(map_.extractor)
         generation = _create_first_generation(context, extractor, job.map_id)
         if generation is None:
             return None
     pipeline = context.models.pipeline_of_generation(context.catalog, generation)
     target = ResolvedGeneration(
-        pipeline.extractor, pipeline.centres, pipeline.projection, generation=generation
+        pipeline.extractor,
+        pipeline.centres,
+        pipeline.projection,
+        generation=generation,
+        matching=Matching(map_.matching),
     )
     # A query's descriptor is not stored: another decoder release is close enough.
     check_spec_matches(generation, target, decoder_matters=job.kind != JobKind.DESCRIBE)

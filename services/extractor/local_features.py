@@ -17,7 +17,7 @@ from services.extractor.handlers import ExtractorContext, JobBatch
 from shared.catalog.chunks import find_descriptor_rows, find_features_model
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import active_generation
-from shared.catalog.maps import Map, Matching
+from shared.catalog.maps import Matching
 from shared.catalog.reconstructions import find_reconstruction
 from shared.errors import Misconfigured, NotFound
 from shared.imaging.decode import DecodedPhoto
@@ -75,22 +75,21 @@ def prepare_features(
     Raises:
         Misconfigured: as `load_detector`, for photos that are stored.
     """
-    is_query = batch.kind == JobKind.DESCRIBE
-    with context.catalog.read() as session:
-        matching = session.get_one(Map, batch.jobs[0].map_id).matching
-        model = find_features_model(session, target.generation.id)
-        source = active_generation(session, batch.jobs[0].map_id)
-        reconstruction = find_reconstruction(session, batch.jobs[0].map_id) if is_query else None
-    uses_matches = target.generation.uses_matches
-    if matching == Matching.OFF:
+    if target.matching == Matching.OFF:
         return None
+    map_id, is_query = batch.jobs[0].map_id, batch.kind == JobKind.DESCRIBE
+    with context.catalog.read() as session:
+        model = find_features_model(session, target.generation.id)
+        source = active_generation(session, map_id) if batch.kind == JobKind.REINDEX else None
+        reconstruction = find_reconstruction(session, map_id) if is_query else None
+    uses_matches = target.generation.uses_matches
     if is_query:
         missing = {
             job.id
             for job in batch.jobs
             if _is_matched(job, uses_matches, reconstruction is not None)
         }
-    elif matching == Matching.ON or uses_matches is not False:
+    elif target.matching == Matching.ON or uses_matches is not False:
         missing = {job.id for job in batch.jobs}
     else:
         return None
@@ -105,7 +104,7 @@ def prepare_features(
         log.error("queries are not matched: %s", error.detail)
         return None
     encoded: dict[UUID, bytes] = {}
-    if batch.kind == JobKind.REINDEX and source is not None:
+    if source is not None:
         with batch.timed("read"):
             stored = read_stored_features(
                 context.catalog,

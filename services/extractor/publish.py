@@ -14,7 +14,7 @@ from typing import Any
 from uuid import UUID
 
 import numpy as np
-from sqlalchemy import insert, select
+from sqlalchemy import and_, insert, select
 from sqlalchemy.orm import Session
 
 from services.extractor.handlers import ExtractorContext, JobBatch
@@ -22,7 +22,7 @@ from services.extractor.local_features import BatchFeatures
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.generations import Generation, GenerationState, lock_generation
 from shared.catalog.maps import increment_map_version, lock_map
-from shared.catalog.photos import get_live_photos
+from shared.catalog.photos import Photo
 from shared.errors import PlacewiseError
 from shared.ids import new_id
 from shared.jobs import Job, JobKind
@@ -114,25 +114,24 @@ def _commit_photos(
         for job in owned.values():
             cancel_job(job) if batch.kind == JobKind.REINDEX else requeue_job(job)
         return outcomes
-    live = get_live_photos(session, [photo_id_of(job) for job in owned.values()])
+    # A batch that lost its lease after its commit has described photos already.
+    of_photo = and_(Descriptor.generation_id == generation_id, Descriptor.photo_id == Photo.id)
+    live_photos = session.execute(
+        select(Photo.id, Descriptor.photo_id.is_not(None))
+        .outerjoin(Descriptor, of_photo)
+        .where(Photo.id.in_([job.photo_id for job in owned.values()]), Photo.deleted_at.is_(None))
+    )
+    is_described: dict[UUID | None, bool] = dict(live_photos.all())
     for job_id, job in list(owned.items()):
-        if job.photo_id not in live:
+        if job.photo_id not in is_described:
             cancel_job(job)
             del owned[job_id]
-    # A batch that lost its lease after its commit has described photos already.
-    described = set(
-        session.scalars(
-            select(Descriptor.photo_id).where(
-                Descriptor.generation_id == generation_id, Descriptor.photo_id.in_(live)
-            )
-        )
-    )
     outcomes["failed"] = _fail_jobs(owned, failed)
     new_rows: list[dict[str, Any]] = []
     for row, claimed in enumerate(ready):
         if (leased := owned.get(claimed.id)) is None:
             continue  # a dead row
-        if leased.photo_id not in described:
+        if not is_described[leased.photo_id]:
             new_rows.append({"photo_id": leased.photo_id, "row": row})
         file_id = str(leased.photo_id)
         succeed_job(leased, {"file_id": file_id, "generation_id": str(generation_id)})

@@ -72,7 +72,8 @@ def claim_jobs(
             .limit(limit - 1)
             .with_for_update(skip_locked=True)
         )
-    session.execute(
+    # The database has set the times: all jobs are refreshed by the same statement.
+    session.scalars(
         update(Job)
         .where(Job.id.in_([job.id for job in batch]))
         .values(
@@ -84,13 +85,8 @@ def claim_jobs(
             run_after=None,
             started_at=func.coalesce(Job.started_at, db_now()),
         )
-        .execution_options(synchronize_session=False)
-    )
-    # Refreshes all of them with one statement: the database has set the times and the token.
-    session.scalars(
-        select(Job)
-        .where(Job.id.in_([job.id for job in batch]))
-        .execution_options(populate_existing=True)
+        .returning(Job)
+        .execution_options(synchronize_session=False, populate_existing=True)
     ).all()
     return batch
 
@@ -120,7 +116,7 @@ def mark_started(session: Session, token: UUID, job_count: int) -> None:
     """Record that the `job_count` jobs under the token run: they may be the cause of a crash."""
     session.execute(
         update(Job)
-        .where(Job.id.in_(session.scalars(select_locked_job_ids(token)).all()))
+        .where(Job.id.in_(select_locked_job_ids(token)))
         .values(claimed_together=job_count)
         .execution_options(synchronize_session=False)
     )

@@ -38,7 +38,7 @@ def extend_lease(session: Session, token: UUID, lease_seconds: float) -> bool:
     """
     updated = session.execute(
         update(Job)
-        .where(Job.id.in_(session.scalars(select_locked_job_ids(token)).all()))
+        .where(Job.id.in_(select_locked_job_ids(token)))
         .values(lease_until=db_now_plus(lease_seconds))
         .execution_options(synchronize_session=False)
     )

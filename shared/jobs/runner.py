@@ -192,13 +192,13 @@ class JobRunner:
 
     def has_jobs(self, min_priority: int | None = None, *, alone: bool = True) -> bool:
         """Return whether `claim` with the same arguments would find a job."""
-        with self.catalog.read() as session:
+        with self.catalog.read_once() as session:
             return has_claimable_jobs(session, self.kinds, min_priority, alone=alone)
 
     def count_waiting(self, limit: int) -> int:
         """Count the jobs that `claim` could claim, up to `limit`."""
         waiting = select(Job.id).where(claimable_condition(self.kinds))
-        with self.catalog.read() as session:
+        with self.catalog.read_once() as session:
             return count_rows(session, waiting, limit)
 
     def claim(
@@ -211,6 +211,8 @@ class JobRunner:
     ) -> ClaimedJobs | None:
         """Claim jobs and begin to renew their lease; see `claim_jobs`. None if there are none."""
         lease_seconds = self.settings.lease_seconds
+        if not self.has_jobs(min_priority, alone=alone):  # most looks, without a transaction
+            return None
         with self.catalog.write() as session:
             jobs = claim_jobs(
                 session,

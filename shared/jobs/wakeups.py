@@ -141,5 +141,5 @@ class InProcessWakeups:
 
 def report_jobs(catalog: Catalog, wakeups: Wakeups, job_ids: Sequence[UUID]) -> None:
     """Tell monitors in which state these jobs are now."""
-    with catalog.read() as session:
+    with catalog.read_once() as session:
         wakeups.report(*session.scalars(select(Job).where(Job.id.in_(job_ids))))

@@ -25,7 +25,7 @@ from shared.matching.features import MIN_SIDE, LocalFeatures
 Keypoints = Sequence[tuple[torch.Tensor, torch.Tensor]]
 
 MIN_CONTRAST = 1.0  # standard deviation of the samples, from 0 to 255
-STEP = 4  # of the rows and columns whose samples are looked at: all of them would take milliseconds
+STEP = 16  # of the rows and columns whose samples are looked at: all would take milliseconds
 
 DETECTORS = {
     "xfeat": "shared.matching.xfeat:XFeatDetector",

@@ -5,8 +5,9 @@ so that PgBouncer in transaction mode works. Without prepared statements the pla
 values: a plan that is good for a map with a million photos is bad for one with ten.
 
 The driver is in autocommit mode, and connections are pinged here: `BEGIN` goes out in one round
-trip with the timeouts, and only a connection that was unused for a while is pinged. The driver's
-own `BEGIN` and SQLAlchemy's `pool_pre_ping` would cost every transaction a round trip more each.
+trip with the timeouts, past SQLAlchemy's execution of statements, and only a connection that was
+unused for a while is pinged. The driver's own `BEGIN` and SQLAlchemy's `pool_pre_ping` would cost
+every transaction a round trip more each.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import psycopg
 from psycopg.abc import RV, PQGen
 from sqlalchemy import Connection, Engine, create_engine, event
 from sqlalchemy.engine import URL
+from sqlalchemy.engine.interfaces import DBAPIConnection
 from sqlalchemy.exc import InvalidatePoolError
 from sqlalchemy.pool import ConnectionPoolEntry
 
@@ -54,6 +56,10 @@ class TimeoutConnection(psycopg.Connection[Any]):
 
     answer_seconds: float | None = PING_TIMEOUT_SECONDS
     """Response timeout; None for no timeout."""
+    limits: TransactionTimeouts | None = None
+    """Those of the next transaction."""
+    begin = ""
+    """The statement that begins it."""
 
     def wait(self, gen: PQGen[RV], interval: float = 0.1, timeout: float | None = None) -> RV:
         try:
@@ -67,8 +73,8 @@ class TimeoutConnection(psycopg.Connection[Any]):
 def make_postgres_engine(url: URL, pool: PoolConfig) -> Engine:
     """Create the engine.
 
-    The execution option `placewise_limits` sets the TransactionTimeouts of its transactions, and
-    `placewise_write=False` makes them read-only, on one snapshot.
+    The execution option `placewise_limits` sets the TransactionTimeouts of its transactions;
+    `placewise_write=False` makes them read-only, on one snapshot; `placewise_once` begins none.
     """
     engine = create_engine(
         url,
@@ -77,7 +83,8 @@ def make_postgres_engine(url: URL, pool: PoolConfig) -> Engine:
         pool_timeout=pool.wait_seconds,
         creator=_connector(url, pool),
     )
-    event.listen(engine, "begin", _begin)
+    event.listen(engine, "begin", _choose_begin)
+    engine.dialect.do_begin = _begin  # type: ignore[assignment,method-assign]
 
     def note_pool(_connection: object, record: ConnectionPoolEntry) -> None:
         record.info[POOL] = engine.pool
@@ -130,17 +137,24 @@ def _connector(url: URL, pool: PoolConfig) -> Callable[[], TimeoutConnection]:
     return connect
 
 
-def _begin(connection: Connection) -> None:
+def _choose_begin(connection: Connection) -> None:
     options = connection.get_execution_options()
-    limits: TransactionTimeouts | None = options.get("placewise_limits")
     driver = connection.connection.driver_connection
     assert isinstance(driver, TimeoutConnection)
-    if options.get("isolation_level") != "AUTOCOMMIT":
-        if not driver.autocommit:  # as SQLAlchemy leaves a connection after AUTOCOMMIT
-            driver.autocommit = True
-        begin = "BEGIN" if options.get("placewise_write", True) else BEGIN_SNAPSHOT
+    driver.limits, driver.begin = options.get("placewise_limits"), ""
+    if options.get("isolation_level") != "AUTOCOMMIT" and not options.get("placewise_once"):
+        driver.begin = "BEGIN" if options.get("placewise_write", True) else BEGIN_SNAPSHOT
+
+
+def _begin(connection: DBAPIConnection) -> None:
+    """Begin the transaction; SQLAlchemy wraps what is raised here, not what its events raise."""
+    driver = connection.driver_connection
+    limits = driver.limits
+    if not driver.autocommit:  # as SQLAlchemy leaves a connection after AUTOCOMMIT
+        driver.autocommit = True
+    if driver.begin:
         driver.answer_seconds = PING_TIMEOUT_SECONDS  # it waits for no lock
-        connection.exec_driver_sql(begin if limits is None else f"{begin};{limits.sql()}")
+        driver.execute(driver.begin if limits is None else f"{driver.begin};{limits.sql()}")
     driver.answer_seconds = None
     if limits is not None and limits.statement_seconds:
         driver.answer_seconds = limits.statement_seconds + ANSWER_MARGIN_SECONDS

@@ -147,11 +147,18 @@ class Catalog:
             self.engine.execution_options(placewise_limits=limits, placewise_write=writes)
             for writes in (False, True)
         )
+        self._once = self._reads.execution_options(placewise_once=True)
 
     @contextlib.contextmanager
     def read(self) -> Iterator[Session]:
         """Open a read-only session on one consistent snapshot."""
         with self._sessions(bind=self._reads) as session:
+            yield session
+
+    @contextlib.contextmanager
+    def read_once(self) -> Iterator[Session]:
+        """Open a session for one quick statement that reads: PostgreSQL begins no transaction."""
+        with self._sessions(bind=self._once) as session:
             yield session
 
     @contextlib.contextmanager

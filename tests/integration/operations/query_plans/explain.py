@@ -73,14 +73,13 @@ class Explainer:
             event.remove(self.catalog.engine, "before_cursor_execute", before)
 
     def _explain(self, connection: Any, call: str, sql: str, parameters: Any) -> StatementPlan:
-        # In the caller's transaction, so that it reads the same rows; rolled back to the savepoint.
-        with connection.connection.cursor() as cursor:
-            cursor.execute("SAVEPOINT explained")
+        # In the caller's transaction, if any, so that it reads the same rows; rolled back.
+        driver = connection.connection.driver_connection
+        with driver.transaction(force_rollback=True), driver.cursor() as cursor:
             for method in ("seqscan", "hashjoin", "mergejoin"):
                 cursor.execute(f"SET LOCAL enable_{method} = off")
             cursor.execute(f"EXPLAIN (ANALYZE, FORMAT JSON) {sql}", parameters)
             plan = cursor.fetchone()[0][0]
-            cursor.execute("ROLLBACK TO SAVEPOINT explained")
         nodes = list(_plan_nodes(plan["Plan"]))
         scans = [node for node in nodes if "Relation Name" in node and "Scan" in node["Node Type"]]
         return StatementPlan(

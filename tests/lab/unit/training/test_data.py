@@ -20,10 +20,12 @@ from lab.training.data import (
     PhotoTransform,
     PlaceBatchSampler,
     PlaceDataset,
+    PlaceSample,
     _init_worker,
     load_batches,
 )
 from lab.training.photo_decoding import decode_resized
+from tests.support.waiting import wait_until
 
 
 def places_of(**counts: int) -> list[TrainingPlace]:
@@ -89,7 +91,31 @@ def test_first_photos_are_taken_without_random_sampling() -> None:
 def test_batches_depend_on_seed_and_epoch_and_not_on_earlier_batches() -> None:
     assert list(PLAN.batches(2)) == list(replace(PLAN).batches(2))
     assert list(PLAN.batches(2)) != list(replace(PLAN, seed=2).batches(2))
-    assert list(PLAN.batches(1, start=3)) == list(PLAN.batches(1))[3:]
+    steps = [*list(PLAN.batches(1))[3:], *PLAN.batches(2), *list(PLAN.batches(3))[:1]]
+    assert list(PLAN.step_batches(range(8, 16))) == steps
+
+
+class RecordingDataset(PlaceDataset):
+    """Writes a file for each place that it loads."""
+
+    folder: Path
+
+    def __getitem__(self, sample: PlaceSample) -> Batch:
+        (self.folder / str(sample.seed)).touch()
+        return super().__getitem__(sample)
+
+
+def test_workers_load_the_next_epoch_before_it_begins(
+    photos_on_disk: list[TrainingPlace], tmp_path: Path
+) -> None:
+    plan = PlaceBatchSampler(photos_on_disk, 2, 2, False, True, 1, 7)
+    photos = RecordingDataset(plan, PhotoTransform((32, 48)), fail_on_undecodable=True)
+    photos.folder = tmp_path
+    batches = load_batches(photos, range(2 * len(plan)), num_workers=1)
+    for _ in range(len(plan)):
+        next(batches)
+    first_of_next_epoch = {str(sample.seed) for sample in next(plan.batches(1))}
+    wait_until(lambda: first_of_next_epoch <= {file.name for file in tmp_path.iterdir()})
 
 
 @pytest.fixture
@@ -113,7 +139,7 @@ def batches_of(
 ) -> Iterator[Batch]:
     plan = PlaceBatchSampler(places, 2, 2, False, True, 1, 7)
     photos = PlaceDataset(plan, PhotoTransform((32, 48)), fail_on_undecodable=True)
-    return load_batches(plan, photos, 0, 0, num_workers=num_workers)
+    return load_batches(photos, range(len(plan)), num_workers=num_workers)
 
 
 def test_a_batch_holds_each_places_photos_with_its_id(photos_on_disk: list[TrainingPlace]) -> None:
@@ -136,7 +162,7 @@ def test_parts_of_a_batch_are_joined_in_its_order(photos_on_disk: list[TrainingP
     places = [replace(place, place_id=n) for n in range(5) for place in photos_on_disk]
     plan = PlaceBatchSampler(places, 18, 2, False, True, 1, 7)
     photos = PlaceDataset(plan, PhotoTransform((32, 48)), fail_on_undecodable=True)
-    loaded = list(load_batches(plan, photos, 0, 0, num_workers=2))
+    loaded = list(load_batches(photos, range(len(plan)), num_workers=2))
     assert [len(batch.photos) for batch in loaded] == [36, 4]
     for batch, samples in zip(loaded, plan.batches(0), strict=True):
         expected = [photos[sample] for sample in samples]
