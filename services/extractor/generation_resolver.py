@@ -49,8 +49,7 @@ class ResolvedGeneration(DescriptorPipeline):
     """A generation with the pipeline that computes its descriptors."""
 
     generation: Generation
-    matching: Matching
-    """That of the map."""
+    matching: Matching  # of the map
 
 
 def resolve_generation(context: ExtractorContext, job: Job) -> ResolvedGeneration | None:

@@ -81,14 +81,10 @@ def prepare_features(
     with context.catalog.read() as session:
         model = find_features_model(session, target.generation.id)
         source = active_generation(session, map_id) if batch.kind == JobKind.REINDEX else None
-        reconstruction = find_reconstruction(session, map_id) if is_query else None
+        is_reconstructed = is_query and find_reconstruction(session, map_id) is not None
     uses_matches = target.generation.uses_matches
     if is_query:
-        missing = {
-            job.id
-            for job in batch.jobs
-            if _is_matched(job, uses_matches, reconstruction is not None)
-        }
+        missing = {job.id for job in batch.jobs if _is_matched(job, uses_matches, is_reconstructed)}
     elif target.matching == Matching.ON or uses_matches is not False:
         missing = {job.id for job in batch.jobs}
     else:
