@@ -226,7 +226,7 @@ def estimate_described(session: Session, generation_id: UUID) -> int:
     )
     if rows and rows > MAX_EXACT_COUNT:
         return int(rows)
-    return count_rows(session, _select_described(generation_id))
+    return count_described(session, generation_id)
 
 
 def list_described(session: Session, generation_id: UUID) -> set[UUID]:

@@ -211,8 +211,6 @@ class JobRunner:
     ) -> ClaimedJobs | None:
         """Claim jobs and begin to renew their lease; see `claim_jobs`. None if there are none."""
         lease_seconds = self.settings.lease_seconds
-        if not self.has_jobs(min_priority, alone=alone):  # most looks, without a transaction
-            return None
         with self.catalog.write() as session:
             jobs = claim_jobs(
                 session,
