@@ -11,7 +11,7 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from uuid import UUID
 
@@ -159,7 +159,7 @@ class WorkerHeartbeat:
         self._catalog = catalog
         self._worker = worker
         self._name = name
-        self._sent_versions: tuple[Mapping[UUID, int], Sequence[str]] | None = None
+        self._sent_versions: Mapping[UUID, int] | None = None
         self._sent_at = 0.0
 
     def run(self, stop: threading.Event) -> None:
@@ -180,12 +180,11 @@ class WorkerHeartbeat:
 
     def send_if_due(self) -> None:
         """Write the entry if the loaded versions have changed, or a heartbeat is due."""
-        status = self._worker.status()
-        versions = status.loaded, status.missing
+        versions = self._worker.status().loaded
         if versions == self._sent_versions and time.monotonic() - self._sent_at < HEARTBEAT_SECONDS:
             return
         with self._catalog.write(is_heartbeat=versions == self._sent_versions) as session:
-            upsert_search_worker(session, self.id, self._name, *versions)
+            upsert_search_worker(session, self.id, self._name, versions)
         self._sent_versions, self._sent_at = versions, time.monotonic()
 
 

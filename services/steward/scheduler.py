@@ -21,7 +21,6 @@ import services.steward.tasks.auto_fit
 import services.steward.tasks.compaction
 import services.steward.tasks.delete_maps
 import services.steward.tasks.garbage_collection
-import services.steward.tasks.generation_repair
 import services.steward.tasks.maintenance
 import services.steward.tasks.model_changes
 import services.steward.tasks.reindex_jobs  # noqa: F401  (they register their tasks)

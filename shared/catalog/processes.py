@@ -16,7 +16,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from importlib.metadata import version
@@ -171,9 +171,6 @@ def list_processes(session: Session) -> list[ProcessStatus]:
     ]
 
 
-UNREADABLE = "unreadable"
-"""Key in `loaded`, next to the generations: the keys of the chunks that the worker can't read."""
-
 # Several heartbeats: a worker without one for longer is dead and does not block activations.
 SEARCH_WORKER_TIMEOUT_SECONDS = 10.0
 
@@ -181,8 +178,7 @@ SEARCH_WORKER_TIMEOUT_SECONDS = 10.0
 class RegisteredSearchWorker(Base):
     """A search worker process.
 
-    `loaded` maps generation ids to the map version up to which all chunks are loaded; it also has
-    the key `UNREADABLE`.
+    `loaded` maps generation ids to the map version up to which all chunks are loaded.
     """
 
     __tablename__ = "search_workers"
@@ -198,16 +194,10 @@ class RegisteredSearchWorker(Base):
 
 
 def upsert_search_worker(
-    session: Session,
-    worker_id: UUID,
-    name: str,
-    loaded: Mapping[UUID, int],
-    unreadable: Sequence[str] = (),
+    session: Session, worker_id: UUID, name: str, loaded: Mapping[UUID, int]
 ) -> None:
-    """Write a heartbeat of the worker with its loaded versions and its unreadable chunks."""
-    versions: dict[str, Any] = {str(id_): version for id_, version in loaded.items()}
-    if unreadable:
-        versions[UNREADABLE] = list(unreadable)
+    """Write a heartbeat of the worker with its loaded versions."""
+    versions = {str(id_): version for id_, version in loaded.items()}
     updated = session.execute(
         update(RegisteredSearchWorker)
         .where(RegisteredSearchWorker.id == worker_id)
@@ -231,16 +221,6 @@ def delete_dead_search_workers(session: Session, *, all_workers: bool = False) -
             RegisteredSearchWorker.seen_at < db_now_plus(-SEARCH_WORKER_TIMEOUT_SECONDS)
         )
     return affected_rows(session.execute(dead))
-
-
-def unreadable_keys(session: Session) -> set[str]:
-    """Return the keys of the chunks that a live worker reports as unreadable."""
-    live = session.scalars(
-        select(RegisteredSearchWorker.loaded).where(
-            RegisteredSearchWorker.seen_at >= db_now_plus(-SEARCH_WORKER_TIMEOUT_SECONDS)
-        )
-    )
-    return {key for loaded in live for key in loaded.get(UNREADABLE, ())}
 
 
 def list_lagging_workers(

@@ -14,8 +14,6 @@ from sqlalchemy import select, update
 
 from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
-from services.steward.tasks import generation_repair, model_changes
-from services.steward.tasks.generation_repair import repair_generations
 from services.steward.tasks.model_changes import SLOW_LOAD_SECONDS, remove_dead_search_workers
 from shared.catalog.database.base import db_now, db_now_plus
 from shared.catalog.database.session import Catalog
@@ -24,13 +22,13 @@ from shared.catalog.jobs import WaitingFor
 from shared.catalog.maps import Map
 from shared.catalog.processes import SEARCH_WORKER_TIMEOUT_SECONDS, RegisteredSearchWorker
 from shared.config.settings import Settings
-from shared.jobs import JobState
+from shared.integrity.verify import repair_descriptors, verify_store
+from shared.jobs import InProcessWakeups, JobState
 from shared.search_api.protocol import SearchRequest
-from shared.storage import FolderStore, read_retries
+from shared.storage import FolderStore
 from shared.storage.chunks import encode_rows
 from shared.storage.keys import QUERIES
 from tests.integration.harness import Harness
-from tests.support.catalog_rows import failure_code
 from tests.support.photos import photo_bytes
 from tests.support.waiting import wait_until
 
@@ -222,8 +220,8 @@ def test_a_switch_waits_for_a_live_search_worker_that_has_not_loaded_and_names_i
 
 
 @pytest.mark.parametrize("damage", ["truncated", "gone"])
-def test_a_damaged_chunk_of_what_is_built_is_described_again_and_then_switched_in(
-    fitted: Harness, register: Register, monkeypatch: pytest.MonkeyPatch, damage: str
+def test_a_damaged_chunk_of_what_is_built_is_repaired_and_then_switched_in(
+    fitted: Harness, register: Register, damage: str
 ) -> None:
     worker = register("worker")
     job_id, new_id = complete(fitted)
@@ -234,13 +232,11 @@ def test_a_damaged_chunk_of_what_is_built_is_described_again_and_then_switched_i
     else:
         fitted.store.put(key, whole[:-1])
     worker.catch_up()
-    repair_generations(fitted.catalog, fitted.store)
-    assert fitted.keys(f"chunks/{new_id}/"), "another look may find it whole"
     fitted.advance()
     assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH
 
-    monkeypatch.setattr(model_changes, "SLOW_LOAD_SECONDS", 0.0)
-    repair_generations(fitted.catalog, fitted.store)
+    report = verify_store(fitted.catalog, fitted.store, originals=False)
+    assert repair_descriptors(fitted.catalog, InProcessWakeups(), report) > 0
     fitted.advance()
     assert fitted.job(job_id).waiting_for == WaitingFor.DESCRIPTORS
     fitted.drain()
@@ -250,41 +246,6 @@ def test_a_damaged_chunk_of_what_is_built_is_described_again_and_then_switched_i
     fitted.advance()
     assert fitted.job(job_id).state == JobState.SUCCEEDED
     assert len(found(worker, fitted, fitted.active())) == PHOTOS
-
-
-def test_a_chunk_that_only_its_worker_can_not_read_is_kept_and_loaded_before_the_switch(
-    fitted: Harness, register: Register, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
-    worker = register("worker")
-    job_id, new_id = complete(fitted)
-    key = next(k for k in fitted.keys(f"chunks/{new_id}/") if k.endswith(".npy"))
-    whole = fitted.store.get(key)
-    fitted.store.put(key, whole[:-1])
-    worker.catch_up()
-    fitted.store.put(key, whole)
-    monkeypatch.setattr(model_changes, "SLOW_LOAD_SECONDS", 0.0)
-    repair_generations(fitted.catalog, fitted.store)
-    fitted.advance()
-    assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH
-    worker.catch_up()
-    fitted.advance()
-    assert fitted.active().id == new_id
-
-
-def test_a_model_change_whose_chunks_are_damaged_again_and_again_fails(
-    fitted: Harness, register: Register, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(generation_repair, "MAX_REPAIRED_CHUNKS", 0)
-    monkeypatch.setattr(model_changes, "SLOW_LOAD_SECONDS", 0.0)
-    worker, old = register("worker"), fitted.active()
-    job_id, new_id = complete(fitted)
-    key = next(k for k in fitted.keys(f"chunks/{new_id}/") if k.endswith(".npy"))
-    fitted.store.put(key, fitted.store.get(key)[:-1])
-    worker.catch_up()
-    repair_generations(fitted.catalog, fitted.store)
-    assert failure_code(fitted.job(job_id)) == "chunk_corrupt"
-    assert fitted.active().id == old.id
 
 
 def test_a_photo_that_comes_while_search_loads_is_described_before_the_switch(
