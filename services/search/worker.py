@@ -292,6 +292,10 @@ class SearchWorker:
             lags=self.replication_lag.current_lags(versions),
         )
 
+    def state(self) -> dict[str, Any]:
+        """Return the versions that are loaded completely, as the process registers them."""
+        return {"loaded": {str(key): version for key, version in self.status().loaded.items()}}
+
     def snapshot(self, generation_id: UUID, min_version: int) -> Snapshot:
         """Return a snapshot at least as new as `min_version`.
 
