@@ -27,7 +27,7 @@ from placewise.protocol import (
     response_error,
     validate_url,
 )
-from shared.errors import Conflict, TooManyRequests, Unavailable
+from shared.errors import TooManyRequests, Unavailable
 from shared.ids import new_id
 
 PAGE_SIZE = 1000  # the server's maximum
@@ -214,7 +214,7 @@ class AsyncTransport:
         while True:
             try:
                 return await call()
-            except (Unavailable, TooManyRequests, Conflict) as error:
+            except (Unavailable, TooManyRequests) as error:
                 is_late = time.monotonic() >= deadline
                 await self._sleep(self._patience.wait_seconds(error, attempt, is_late))
                 attempt += 1

@@ -44,7 +44,7 @@ from shared.storage import ObjectStore, OwnedStore
 # Tables that may have rows after a first start.
 TABLES_WITH_INITIAL_ROWS = {
     table.__tablename__
-    for table in (*(ApiKey, Installation, Map, CachedMapStatistics, Model, RegisteredProcess),)
+    for table in (ApiKey, Installation, Map, CachedMapStatistics, Model, RegisteredProcess)
 }
 
 

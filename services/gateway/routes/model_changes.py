@@ -143,7 +143,7 @@ def _queue_import(
 ) -> JobAcceptedResponse:
     upload = file.complete()
     params = {"object_key": upload.key, "filename": upload.filename}
-    with idempotent.claim_form(upload), gateway.catalog.write() as session:
+    with idempotent.begin_form(upload), gateway.catalog.write() as session:
         map_id = get_map(session, map_name).id
         job = start_model_change(session, map_id, JobKind.IMPORT, params)
         accepted = idempotent.accept_job(session, job)

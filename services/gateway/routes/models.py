@@ -136,7 +136,7 @@ def _queue_model(
     gateway: GatewayContext, map_name: str, file: FormFile, idempotent: IdempotentRequest
 ) -> JobAcceptedResponse:
     upload = file.complete()
-    with idempotent.claim_form(upload), gateway.catalog.write() as session:
+    with idempotent.begin_form(upload), gateway.catalog.write() as session:
         job = Job(
             id=new_id(),
             map_id=get_map(session, map_name).id,

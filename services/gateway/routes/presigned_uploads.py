@@ -48,7 +48,6 @@ from services.gateway.routes.uploads import (
     wait_for_description,
 )
 from shared.catalog.database.base import db_now_plus
-from shared.catalog.idempotency import StoredResponse
 from shared.catalog.maps import get_map
 from shared.catalog.photos import PresignedUpload, get_presigned_upload
 from shared.errors import Conflict, NotFound, Unavailable, Unprocessable
@@ -275,7 +274,7 @@ def _replay_if_completed(upload: PresignedUpload) -> None:
     assert upload.status is not None
     status_url = json.loads(upload.response_body)["status_url"]
     headers = accepted_headers(status_url) if upload.status == 202 else {"Location": status_url}
-    raise IdempotentReplay(StoredResponse(upload.status, headers, upload.response_body))
+    raise IdempotentReplay(upload.status, headers, upload.response_body)
 
 
 def _parse_photo_fields(values: dict[str, Any]) -> PhotoFields:

@@ -202,7 +202,7 @@ def _queue_query(
     idempotent: IdempotentRequest,
 ) -> Job:
     upload = file.complete()
-    with idempotent.claim_form(upload, QUERY_TTL_SECONDS):
+    with idempotent.begin_form(upload, QUERY_TTL_SECONDS):
         for name in upload.fields:
             raise invalid_field_error(name, "is unknown; send filters as query parameters")
         with upload.open(gateway.store) as photo:

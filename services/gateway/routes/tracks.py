@@ -280,7 +280,7 @@ def _accept_frame(
 ) -> TrackFrame:
     """Store the frame with its job, or return the frame that it repeats."""
     received = file.complete()
-    with idempotent.claim_form(received, QUERY_TTL_SECONDS):
+    with idempotent.begin_form(received, QUERY_TTL_SECONDS):
         form = parse_frame_form(received.fields)
         with received.open(gateway.store) as photo:
             header = read_photo_header(photo, gateway.settings.max_image_pixels)
