@@ -13,7 +13,7 @@ from __future__ import annotations
 import hmac
 import logging
 import re
-from collections.abc import Container, Iterable
+from collections.abc import Container
 from dataclasses import dataclass, field
 from typing import Annotated, Protocol
 from urllib.parse import urlsplit
@@ -298,13 +298,9 @@ async def _require_scope(
     scopes: SecurityScopes,
     _documented_scheme: Annotated[object, Security(BEARER_SCHEME)],
 ) -> None:
-    check_scopes(request, scopes.scopes)
-
-
-def check_scopes(request: Request, scopes: Iterable[str]) -> None:
     """Raise Forbidden if the caller lacks a scope, or may not use the request's map."""
     caller = get_caller(request)
-    missing = set(scopes) - caller.scopes
+    missing = set(scopes.scopes) - caller.scopes
     if missing:
         raise Forbidden(
             "scope_missing",

@@ -9,14 +9,13 @@ from pydantic import Field
 
 from services.gateway.authentication import ADMIN
 from services.gateway.dependencies import NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep, KeyId
-from services.gateway.json_bodies import JsonRoute
 from shared.catalog.api_keys import KeyLimits, create_api_key, list_api_keys, revoke_api_key
 from shared.catalog.maps import MAP_NAME_PATTERN
 from shared.http.request_model import RequestModel
 from shared.responses.maps import CreatedKeyResponse, KeyResponse
 from shared.security.api_keys import Scope
 
-router = APIRouter(tags=["administration"], dependencies=[NO_PARAMETERS], route_class=JsonRoute)
+router = APIRouter(tags=["administration"], dependencies=[NO_PARAMETERS])
 
 DAY_SECONDS = 86_400
 MAX_KEY_DAYS = 36_500

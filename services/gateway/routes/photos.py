@@ -29,7 +29,6 @@ from services.gateway.dependencies import (
     PageParams,
     invalid_cursor_error,
 )
-from services.gateway.json_bodies import JsonRoute
 from services.gateway.photo_search import MAX_COUNTED_MATCHES, MetadataFilter, search_photos
 from services.gateway.responses import JobAcceptedResponse, MetadataSearchResponse, photo_response
 from services.gateway.similarity.search_params import (
@@ -69,7 +68,7 @@ from shared.responses.jobs import DeletedPhotoResponse
 from shared.responses.similarity import PhotoDetailResponse, PhotoResponse
 from shared.storage.keys import preview_key, thumbnail_key
 
-router = APIRouter(tags=["photos"], route_class=JsonRoute)
+router = APIRouter(tags=["photos"])
 
 STREAM_READ_BYTES = 256 * 1024
 IMAGE_RESPONSE: dict[int | str, dict[str, Any]] = {

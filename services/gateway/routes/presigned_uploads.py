@@ -38,7 +38,6 @@ from services.gateway.dependencies import (
     UploadId,
 )
 from services.gateway.idempotency import IdempotentDep, IdempotentReplay, delete_if_refused
-from services.gateway.json_bodies import JsonRoute
 from services.gateway.responses import accepted_headers, url_in_map
 from services.gateway.routes.photos import PhotoUpdate
 from services.gateway.routes.uploads import (
@@ -66,7 +65,7 @@ from shared.responses.jobs import UploadResponse
 from shared.storage import ObjectInfo, PresigningStore
 from shared.storage.keys import incoming_key, new_original_key
 
-router = APIRouter(tags=["photos"], route_class=JsonRoute)
+router = APIRouter(tags=["photos"])
 
 PRESIGN_SECONDS = 900  # to send and complete an upload: 100 MB at 1 Mbit/s
 FILE_FIELDS = ("filename", "file_size", "sha256")
