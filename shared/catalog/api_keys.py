@@ -31,8 +31,6 @@ from shared.errors import NotFound, Unauthorized, invalid_field_error
 from shared.ids import new_id
 from shared.security.api_keys import Scope, api_key_prefix, generate_api_key, hash_api_key
 
-LAST_USED_RESOLUTION_SECONDS = 60.0  # of `last_used_at`
-
 
 class ApiKey(Journaled, Base):
     """An API key. A limit that is null defaults to the one of the settings."""
@@ -162,16 +160,10 @@ def has_admin_key(session: Session) -> bool:
 
 
 def record_key_use(session: Session, key_id: UUID) -> None:
-    """Set `last_used_at`, at most once per LAST_USED_RESOLUTION_SECONDS."""
+    """Set `last_used_at` to now."""
     session.execute(
         update(ApiKey)
-        .where(
-            ApiKey.id == key_id,
-            or_(
-                ApiKey.last_used_at.is_(None),
-                ApiKey.last_used_at < db_now_plus(-LAST_USED_RESOLUTION_SECONDS),
-            ),
-        )
+        .where(ApiKey.id == key_id)
         # `revision` is set explicitly: otherwise the journal would record each use.
         .values(last_used_at=db_now(), revision=ApiKey.revision)
         .execution_options(synchronize_session=False)
