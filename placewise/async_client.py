@@ -658,7 +658,7 @@ class AsyncClient(AsyncTransport):
             name: Owner or purpose.
             scopes: `read`, `write`, `admin`.
             limits: The optional fields of `POST /keys`: `maps`, `days`, `requests_per_minute`,
-                `upload_bytes_per_day`, `max_photos`.
+                `max_photos`.
         """
         body = {"name": name, "scopes": list(scopes), **drop_none(**limits)}
         return answers.CreatedKey(**await self._call("POST", "/keys", json=body))

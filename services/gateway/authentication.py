@@ -191,7 +191,7 @@ class ApiKeyAuthenticator:
             identity=f"key {key.id}",
             scopes=expand_scopes([KeyScope(scope) for scope in key.scopes]),
             key_id=key.id,
-            limits=KeyLimits(key.requests_per_minute, key.upload_bytes_per_day, key.max_photos),
+            limits=KeyLimits(key.requests_per_minute, key.max_photos),
             maps=None if key.maps is None else frozenset(key.maps),
         )
 

@@ -44,7 +44,6 @@ class ApiKey(Journaled, Base):
     scopes: Mapped[list[str]] = mapped_column(JsonValue)
     maps: Mapped[list[str] | None] = mapped_column(JsonValue)  # names; None: all maps
     requests_per_minute: Mapped[int | None] = mapped_column(Integer)
-    upload_bytes_per_day: Mapped[int | None] = mapped_column(BigInteger)
     max_photos: Mapped[int | None] = mapped_column(BigInteger)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     expires_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
@@ -57,7 +56,6 @@ class KeyLimits:
     """Rate limit and quotas of a key; None defaults to the limit of the settings."""
 
     requests_per_minute: int | None = None
-    upload_bytes_per_day: int | None = None
     max_photos: int | None = None
 
 
@@ -100,7 +98,6 @@ def create_api_key(
         maps=None if maps is None else sorted(set(maps)),
         expires_at=None if life_seconds is None else db_now_plus(life_seconds),
         requests_per_minute=limits.requests_per_minute,
-        upload_bytes_per_day=limits.upload_bytes_per_day,
         max_photos=limits.max_photos,
     )
     session.add(row)

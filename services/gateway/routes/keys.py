@@ -44,7 +44,6 @@ class CreateKeyRequest(RequestModel):
         description="days until it expires; null: never",
     )
     requests_per_minute: Annotated[int | None, Field(ge=1, le=10**9)] = None
-    upload_bytes_per_day: KeyLimit = None
     max_photos: KeyLimit = None
 
 
@@ -62,7 +61,7 @@ def create_key(gateway: GatewayDep, body: CreateKeyRequest) -> CreatedKeyRespons
     Therefore this endpoint does not support `Idempotency-Key`: if the response is lost, revoke the
     key and create another one.
     """
-    limits = KeyLimits(body.requests_per_minute, body.upload_bytes_per_day, body.max_photos)
+    limits = KeyLimits(body.requests_per_minute, body.max_photos)
     life_seconds = None if body.days is None else body.days * DAY_SECONDS
     with gateway.catalog.write() as session:
         api_key, secret = create_api_key(

@@ -101,7 +101,6 @@ class PresignResponse(ResponseModel):
     dependencies=[WRITE, CHECK_PHOTO_QUOTA, ADMIT_JOB],
 )
 def create_presigned_upload(
-    request: Request,
     gateway: GatewayDep,
     body: PresignRequest,
     idempotent: IdempotentDep,
@@ -118,7 +117,6 @@ def create_presigned_upload(
         raise file_too_large_error(limit)
     fields = body.photo_fields()
     _parse_photo_fields(fields)  # refuses invalid fields before the file is sent
-    request.app.state.rate_limiter.count_upload_bytes(get_caller(request), body.file_size)
     upload_id = new_id()
     put = store.presign_put(
         incoming_key(upload_id),
