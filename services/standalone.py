@@ -39,14 +39,13 @@ from services.steward.scheduler import Scheduler
 from services.steward.tasks.maintenance import reclaim_leases
 from services.steward.webhooks import WebhookDispatcher
 from shared.catalog.api_keys import create_api_key, has_admin_key
-from shared.catalog.database.schema import migrate, sqlite_file
+from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import REQUEST_TIMEOUTS, Catalog
 from shared.catalog.generations import RowType
 from shared.catalog.installation import check_before_new_catalog, open_installation_store
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.processes import delete_processes, process_heartbeat
 from shared.catalog.tables import open_catalog
-from shared.config.disk_space import DiskReserve
 from shared.config.embedded_home import announce_server, lock_home
 from shared.config.settings import Settings
 from shared.errors import Misconfigured, PlacewiseError
@@ -139,8 +138,6 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         listener = stack.enter_context(listen(settings.host, settings.port))
         catalog = open_catalog(settings, "embedded")
         stack.callback(catalog.close)
-        if (file := sqlite_file(catalog)) is not None:
-            DiskReserve(file.parent, settings.min_free_bytes).release()
         check_before_new_catalog(catalog, settings)
         migrate(catalog)
         store = open_installation_store(catalog, settings, exclusive=True)

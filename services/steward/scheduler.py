@@ -30,9 +30,7 @@ from services.steward.tasks.orphans import (
     empty_expired_trash,
 )
 from shared.catalog.database.errors import OutageLog
-from shared.catalog.database.schema import sqlite_file
 from shared.catalog.database.session import IDLE_SECONDS, Catalog, ChangePoll
-from shared.config.disk_space import DiskReserve
 from shared.config.settings import Settings
 from shared.jobs import Wakeups
 from shared.journal.outbox import write_journal, write_snapshot
@@ -101,10 +99,6 @@ class Scheduler:
                 uses_catalog=False,
             ),
         ]
-        # On the disk of the SQLite file; PostgreSQL reserves its own space.
-        if (catalog_file := sqlite_file(catalog)) is not None:
-            reserve = DiskReserve(catalog_file.parent, settings.min_free_bytes)
-            self.tasks.insert(0, PeriodicTask("keep_disk_reserve", 5.0, reserve.maintain))
 
     def run(self, stop: threading.Event) -> None:
         """Run due tasks until `stop` is set; then write the pending rows to the journal."""
