@@ -281,10 +281,7 @@ def _check_search(gateway: GatewayContext) -> ComponentStatus:
     if problems:
         return ComponentStatus(status="degraded", detail="; ".join(problems))
     place = "Milvus" if gateway.settings.search_engine == "milvus" else "memory"
-    detail = f"{status.rows} rows in {place}"
-    if status.recalls:
-        detail += f", recall of recent answers {min(status.recalls.values()):.3f}"
-    return ComponentStatus(status="healthy", detail=detail)
+    return ComponentStatus(status="healthy", detail=f"{status.rows} rows in {place}")
 
 
 def _check_messages(gateway: GatewayContext, depth: QueueDepth) -> QueueStatus:
