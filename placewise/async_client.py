@@ -468,19 +468,15 @@ class AsyncClient(AsyncTransport):
         generation_id: Id,
         file: BinaryIO,
         on_received: Callable[[int], object] = lambda received_bytes: None,
-        *,
-        features: bool = False,
     ) -> None:
         """Download a tar with `descriptors.npy`, `names.txt` and `photos.csv` into a file.
-
-        With `features`, the tar also has the local features, `local.features`.
 
         Args:
             file: Seekable and writable; overwritten from its beginning.
             on_received: Called with the number of bytes received so far.
         """
         path = f"/generations/{generation_id}/descriptors"
-        await self._download(path, file, on_received, **({"features": True} if features else {}))
+        await self._download(path, file, on_received)
 
     async def reconstruct(self, *, from_scratch: bool = False) -> answers.Started:
         """Start reconstructing the map's photos, or registering new ones into its reconstruction.

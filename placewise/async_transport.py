@@ -169,7 +169,7 @@ class AsyncTransport:
                 return
 
     async def _download(
-        self, path: str, file: BinaryIO, on_received: Callable[[int], object], **params: bool
+        self, path: str, file: BinaryIO, on_received: Callable[[int], object]
     ) -> None:
         """Stream a response into a file, which is truncated before each attempt."""
 
@@ -180,7 +180,7 @@ class AsyncTransport:
         async def attempt() -> None:
             file.seek(0)
             file.truncate()
-            await self._check(self._receive(f"{API}{path}", write, params=params))
+            await self._check(self._receive(f"{API}{path}", write))
 
         await self._retry(attempt)
 
