@@ -282,7 +282,10 @@ def _check_search(gateway: GatewayContext) -> ComponentStatus:
     if problems:
         return ComponentStatus(status="degraded", detail="; ".join(problems))
     place = "Milvus" if gateway.settings.search_engine == "milvus" else "memory"
-    return ComponentStatus(status="healthy", detail=f"{status.rows} rows in {place}")
+    detail = f"{status.rows} rows in {place}"
+    if status.recalls:
+        detail += f", recall of recent answers {min(status.recalls.values()):.3f}"
+    return ComponentStatus(status="healthy", detail=detail)
 
 
 def _check_messages(gateway: GatewayContext, depth: QueueDepth) -> QueueStatus:
