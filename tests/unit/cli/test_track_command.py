@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -226,7 +225,7 @@ RIDE = track_of(
 
 
 def test_files_of_a_track_have_its_frames_and_no_line_where_it_is_lost(tmp_path: Path) -> None:
-    names = ("csv", "gpx", "geojson")
+    names = ("csv", "gpx")
     files = {name: tmp_path / f"ride.{name}" for name in names}
     check_track_files(list(files.values()))
     for file in files.values():
@@ -244,17 +243,6 @@ def test_files_of_a_track_have_its_frames_and_no_line_where_it_is_lost(tmp_path:
     assert first is not None
     assert first.attrib == {"lat": "45.0000000", "lon": "7.0000000"}
     assert first.findtext("g:time", namespaces=space) == "2026-05-01T12:00:00Z"
-    features = json.loads(files["geojson"].read_text())["features"]
-    lines = [f for f in features if f["properties"]["kind"] == "track"]
-    assert [line["geometry"]["coordinates"] for line in lines] == [[[7.0, 45.0], [7.0, 45.001]]]
-    points = [f["geometry"] for f in features if f["properties"]["kind"] == "frame"]
-    assert [point and point["coordinates"] for point in points] == [
-        [7.0, 45.0],
-        [7.0, 45.001],
-        [7.0, 45.9],
-        None,
-        [7.0, 45.002],
-    ]
     assert located_segments(track_of(None)) == []
 
 
