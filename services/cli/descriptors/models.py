@@ -21,7 +21,7 @@ from services.cli.descriptors.local_weights import (
     list_extractor_configs,
     save_record,
 )
-from services.cli.environment import import_lab, read_settings
+from services.cli.environment import read_settings
 from services.cli.output import (
     JsonOption,
     KeyOption,
@@ -29,8 +29,6 @@ from services.cli.output import (
     ServerOption,
     Table,
     err_console,
-    format_pca,
-    print_failures,
     print_json,
     print_message,
     print_result,
@@ -38,11 +36,11 @@ from services.cli.output import (
     progress_bar,
 )
 from shared.errors import Misconfigured
-from shared.extractor_config.configs import MAX_PCA_DIMENSION, get_extractor_config
+from shared.extractor_config.configs import get_extractor_config
 
 EXPORTED_NETWORK = {"backbone_arch": "exported", "agg_arch": ""}  # nothing else is known of it
 
-app = typer.Typer(help="Manage extractor weights, trained models and PCA files.")
+app = typer.Typer(help="Manage extractor weights and trained models.")
 
 
 @app.command("add")
@@ -232,39 +230,6 @@ def fetch(
     print_message(f"Licence: {weights.licence}. Fingerprint: {weights.fingerprint}.")
     if config.hub is not None and config.name not in settings.allowed_hub_extractors:
         print_message(f"To allow maps to use it, set CODE_ALLOWED={config.name}")
-
-
-@app.command("fit-pca")
-def fit_pca(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            metavar="ROWS.npy|DIR",
-            exists=True,
-            help="Rows written by `describe`, or photos below a folder.",
-        ),
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE.safetensors", help="Output file.")],
-    dimension: Annotated[
-        int, typer.Option(min=1, max=MAX_PCA_DIMENSION, help="Number of dimensions to keep.")
-    ] = 512,
-    extractor: Annotated[
-        str | None, typer.Option(help="With DIR: extractor name. Default: the setting EXTRACTOR.")
-    ] = None,
-    vocabulary: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="With DIR: VLAD vocabulary.")
-    ] = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Fit a PCA whitening without a server and write it to a file for `describe --pca`."""
-    fits = import_lab("lab.cli.descriptors.fits", "`models fit-pca`")
-    with progress_bar() as progress:
-        fitted = fits.fit_pca_locally(
-            source, out, dimension, extractor=extractor, vocabulary=vocabulary, progress=progress
-        )
-    if not as_json:
-        print_failures(fitted, "refused")
-    print_result(fitted, as_json, f"{fitted['file']}: {format_pca(fitted)}.")
 
 
 def _format_megabytes(size_bytes: int | None) -> str:
