@@ -6,7 +6,7 @@ of `placewise train` and exported networks on a server.
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -15,12 +15,7 @@ from rich.markup import escape
 from rich.table import Column
 
 from services.cli.client import connect, wait_for_job
-from services.cli.descriptors.local_weights import (
-    WeightsRecord,
-    inspect_weights,
-    list_extractor_configs,
-    save_record,
-)
+from services.cli.descriptors.local_weights import inspect_weights, list_extractor_configs
 from services.cli.environment import read_settings
 from services.cli.output import (
     JsonOption,
@@ -28,7 +23,6 @@ from services.cli.output import (
     MapOption,
     ServerOption,
     Table,
-    err_console,
     print_json,
     print_message,
     print_result,
@@ -149,27 +143,14 @@ def remove(
 
 @app.command("list")
 def list_(as_json: JsonOption = False) -> None:
-    """List extractors and their weights on this machine.
-
-    The first listing reads each weights file to compute its fingerprint.
-    """
+    """List extractors and their weights on this machine."""
     settings = read_settings()
-    with err_console.status("Searching for weights") as status:
-
-        def reading(path: Path) -> None:
-            status.update(f"Computing the fingerprint of {path}")
-
-        all_weights = [
-            inspect_weights(config, settings, reading)
-            for config in list_extractor_configs(settings)
-        ]
+    all_weights = [inspect_weights(config, settings) for config in list_extractor_configs(settings)]
     if as_json:
         print_json([asdict(weights) for weights in all_weights])
         return
     name = Column("extractor", overflow="fold", min_width=23)
-    table = Table(
-        name, "available", "size", Column("source", overflow="fold"), "licence", "fingerprint"
-    )
+    table = Table(name, "available", "size", Column("source", overflow="fold"), "licence")
     for weights in all_weights:
         table.add_row(
             escape(weights.extractor),
@@ -177,7 +158,6 @@ def list_(as_json: JsonOption = False) -> None:
             _format_megabytes(weights.size_bytes),
             escape(weights.source),
             escape(weights.licence),
-            (weights.fingerprint or "")[:12],
         )
     print_table(table)
 
@@ -206,7 +186,6 @@ def fetch(
         )
     from shared.descriptors.backbones import backbone_class  # imports torch
 
-    dimension = config.dimension
     with progress_bar() as progress:
         bar = progress.add_task(f"{escape(config.name)} (bytes)", visible=False)
 
@@ -214,11 +193,11 @@ def fetch(
             progress.update(bar, completed=done, total=total, visible=True)
 
         loaded = backbone_class(config).fetch(config, settings.dino_weights, on_progress)
+    weights = inspect_weights(config, settings)
+    dimension = config.dimension
     if loaded is not None:
         dimension = loaded.width
-        found = loaded.find_weights(config, settings.dino_weights)
-        save_record(found.key, WeightsRecord(loaded.fingerprint, loaded.card["size_bytes"]))
-    weights = inspect_weights(config, settings)
+        weights = replace(weights, size_bytes=loaded.card["size_bytes"])
     if not weights.available:
         raise Misconfigured("weights_unusable", weights.note or "")
     if as_json:
@@ -227,7 +206,7 @@ def fetch(
     size_text = _format_megabytes(weights.size_bytes)
     print_message(f"{weights.extractor}: {dimension} dimensions, {size_text} of weights.")
     print_message(f"Source: {weights.source}. Path: {weights.path}.")
-    print_message(f"Licence: {weights.licence}. Fingerprint: {weights.fingerprint}.")
+    print_message(f"Licence: {weights.licence}.")
     if config.hub is not None and config.name not in settings.allowed_hub_extractors:
         print_message(f"To allow maps to use it, set CODE_ALLOWED={config.name}")
 
