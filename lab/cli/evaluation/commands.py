@@ -327,9 +327,7 @@ def compare(
     ] = None,
     protocol: ProtocolOption = None,
     rule: RuleOption = None,
-    out: Annotated[
-        Path | None, typer.Option(help="DIR: output folder for table.csv, table.tex and a figure.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="DIR: output folder for table.csv.")] = None,
     faiss_gpu: FaissGpuOption = False,
     extractor: Annotated[
         list[str] | None,
