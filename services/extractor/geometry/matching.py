@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from services.extractor.geometry.pairs import Pairs
 from shared.geometry.component import UNREADABLE
 from shared.matching.features import LocalFeatures
-from shared.matching.matchers import Matcher
+from shared.matching.matchers import MutualNearest
 from shared.matching.verification import verify_matches
 
 MIN_INLIERS = 15
@@ -75,7 +75,7 @@ class VerifiedMatches:
 def match_pairs(
     photos: Mapping[UUID, LocalFeatures],
     pairs: Pairs,
-    matcher: Matcher,
+    matcher: MutualNearest,
     on_progress: Callable[[int], None],
     threads: int = min(os.cpu_count() or 1, 4),
 ) -> VerifiedMatches:
