@@ -6,6 +6,7 @@ read from the catalog and are therefore the same on every gateway.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Sequence
 from functools import partial
 
@@ -167,6 +168,12 @@ class _LoadCollector(Collector):
             oldest.add_metric([job_kind, state], oldest_seconds)
         yield jobs
         yield oldest
+        with contextlib.suppress(SQLAlchemyError):
+            yield _gauge(
+                "extractors_stalled",
+                "1 if a job waits much longer than usual while none is finished.",
+                value=float(self._admission.queue_depth().is_stalled),
+            )
 
 
 def _gauge(

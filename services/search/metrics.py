@@ -152,6 +152,7 @@ class _SnapshotCollector(Collector):
         )
         lags = status.lags.items()
         of_generations: tuple[tuple[str, str, Mapping[UUID, float]], ...] = (
+            ("recall", "Measured recall of an approximate index.", status.recalls),
             ("version", "Version of the map in the snapshot.", status.versions),
             ("lag_versions", "Versions behind the map.", {k: lag.versions for k, lag in lags}),
             (

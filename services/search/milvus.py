@@ -12,8 +12,9 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
+import random
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -57,6 +58,7 @@ from shared.search_api.protocol import (
     SearchHit,
     SearchRequest,
     SearchResponse,
+    SearchStatus,
 )
 from shared.storage import ObjectStore
 from shared.storage.chunks import Row, read_chunk, read_rows, rows_are_valid
@@ -71,7 +73,7 @@ READ_SECONDS = 4.0  # less than the time that the gateway gives a search
 WRITE_SECONDS = 60.0
 STEP_SECONDS = 3.0  # of writing, between two snapshots
 UNKNOWN_SECONDS = 30.0  # a server that was just started may not know its collections yet
-CHECK_SECONDS = 60.0  # interval of the counts of what a collection holds
+CHECK_SECONDS = 60.0  # interval of the counts of what a collection holds, and of its recall
 BATCH_BYTES = 16_000_000  # of rows in one call; a message may have 64 MB
 IDS_PER_CALL = 1000
 FEW_ROWS = 32  # are read one by one, not with their whole chunk
@@ -80,6 +82,7 @@ MAX_LIMIT = 16_384  # results of one search
 MAX_TEXT_BYTES = 65_535
 MARGIN = 16  # candidates beyond k, as products of float32 may rank the last ones otherwise
 GROWTH = 4  # of the number of candidates, where too few pass the filter or decide the answer
+RECALL_ANSWERS = 32
 MARK = "~version"  # keys of photos are hexadecimal digits
 PHOTOS = 'photo < "~"'
 
@@ -135,6 +138,12 @@ class _Watch:
     unknown_since: float = math.inf
     wrong: set[str] = field(default_factory=set)
     """Keys of photos whose rows differ from those of their chunks."""
+    answers: deque[tuple[MilvusSnapshot, Row, tuple[SearchHit, ...]]] = field(
+        default_factory=partial(deque, maxlen=RECALL_ANSWERS)
+    )
+    found: float = 0.0
+    expected: float = 0.0
+    """Rows of chunks that answers had to have; `found` of them were there."""
 
 
 class MilvusWorker(SearchWorker):
@@ -165,6 +174,12 @@ class MilvusWorker(SearchWorker):
     def client(self) -> MilvusClient:
         """The connection to Milvus."""
         return MilvusClient(self._uri, timeout=READ_SECONDS)
+
+    def status(self) -> SearchStatus:
+        """Return what the collections hold."""
+        watches = list(self._watches.items())
+        recalls = {key: one.found / one.expected for key, one in watches if one.expected}
+        return super().status().model_copy(update={"recalls": recalls})
 
     @engine_errors()
     def _list_stored(self) -> list[str]:
@@ -244,6 +259,7 @@ class MilvusWorker(SearchWorker):
                 written = self._find_losses(generation_id, name, described, written)
             if described is not None:
                 watch.check_at = time.monotonic() + CHECK_SECONDS
+                self._measure_recall(watch, list(chunks.values()))
             # Searches wait for the time of this process's last write ("Session"), and so see what
             # any process wrote before. With "Strong" each would wait for the present time, which
             # Milvus announces five times a second.
@@ -420,6 +436,29 @@ class MilvusWorker(SearchWorker):
         self._delete(name, sorted(others))
         return frozenset()
 
+    def _measure_recall(self, watch: _Watch, chunks: Sequence[Chunk]) -> None:
+        """Compare recent answers with a random chunk, whose more similar rows have to be there."""
+        if not watch.answers:
+            return
+        (chunk,) = random.sample(chunks, 1)
+        try:
+            rows = read_chunk(self._store, chunk.object_key, chunk.sha256).astype(np.float32)
+        except UNREADABLE as error:
+            log.warning("%s is left out of the recall: %s", chunk.object_key, error)
+            return
+        with self._catalog.read() as session:
+            values = list_live_filter_values(session, chunk.id)
+        photos = {row: photo.photo_id for row, photo in values if photo.findable}
+        watch.found, watch.expected = 0.9 * watch.found, 0.9 * watch.expected
+        while watch.answers:
+            snapshot, vector, hits = watch.answers.popleft()
+            if chunk.object_key in snapshot.written:
+                least = hits[-1].score + 2 * float32_error(rows.shape[1])
+                better = np.flatnonzero(rows @ vector > least).tolist()
+                expected = {photos[row] for row in better if row in photos}
+                watch.expected += len(expected)
+                watch.found += len(expected & {hit.photo_id for hit in hits})
+
     @engine_errors()
     def _find_rows(self, snapshot: Snapshot, query: Row, request: SearchRequest) -> SearchResponse:
         """Return the most similar rows.
@@ -462,10 +501,13 @@ class MilvusWorker(SearchWorker):
                 break
             limit = min(GROWTH * limit, MAX_LIMIT)
         certificate = EXHAUSTIVE if is_exact and complete else APPROXIMATE
+        watch = self._watches[snapshot.generation_id]
         wrong = {id_.hex for id_, score in scores.items() if abs(products[id_] - score) > error}
-        self._watches[snapshot.generation_id].wrong |= wrong
+        watch.wrong |= wrong
         if wrong or missing:
             certificate = NONE
+        elif not is_exact and len(hits) == request.k and condition == FINDABLE:
+            watch.answers.append((snapshot, unit, hits))
         return SearchResponse(
             hits=hits,
             certificate=certificate,

@@ -23,6 +23,9 @@ from shared.catalog.maps import Map
 
 THROUGHPUT_WINDOW_SECONDS = 60.0
 MAX_COUNTED_FINISHED = 100_000  # in THROUGHPUT_WINDOW_SECONDS: above any real throughput
+USUAL_JOBS = 50  # whose mean duration is the usual one
+STALLED_FACTOR = 5
+STALLED_SECONDS = 60.0  # at least
 
 # All but `reindex`: a model change queues every photo of its map, with the lowest priority.
 BACKLOG_PRIORITIES = (Priority.UPLOAD, Priority.BATCH, Priority.MODEL_CHANGE, Priority.EVALUATION)
@@ -81,10 +84,18 @@ class QueueDepth:
     """Uploads and queries that succeeded or failed in the last THROUGHPUT_WINDOW_SECONDS."""
     oldest_seconds: float = 0.0
     """Age of the oldest job or query that a worker could claim; 0 if there is none."""
+    usual_seconds: float = 0.0
+    """Mean duration of the last uploads and queries that ended, from the claim."""
 
     @property
     def finished_per_second(self) -> float:
         return self.finished / THROUGHPUT_WINDOW_SECONDS
+
+    @property
+    def is_stalled(self) -> bool:
+        """Whether a job has waited for STALLED_FACTOR times the usual, and nothing finishes."""
+        patience = max(STALLED_SECONDS, STALLED_FACTOR * self.usual_seconds)
+        return not self.finished and self.oldest_seconds > patience
 
     @property
     def jobs(self) -> int:
@@ -104,6 +115,7 @@ def measure_queue_depth(session: Session, limit: int) -> QueueDepth:
         queries,
         count_rows(session, finished, MAX_COUNTED_FINISHED),
         _oldest_seconds(session),
+        _usual_seconds(session),
     )
 
 
@@ -117,6 +129,23 @@ def _oldest_seconds(session: Session) -> float:
         for created_at, now in session.execute(of_priority.order_by(Job.id).limit(1)):
             ages.append((now - created_at).total_seconds())
     return max(ages)
+
+
+def _usual_seconds(session: Session) -> float:
+    ended = (
+        select(Job.started_at, Job.finished_at)
+        .where(
+            Job.kind.in_((JobKind.INDEX, JobKind.DESCRIBE)),
+            Job.started_at.is_not(None),
+            Job.finished_at.is_not(None),
+        )
+        .order_by(Job.finished_at.desc())
+        .limit(USUAL_JOBS)
+    )
+    seconds = [
+        (end - begin).total_seconds() for begin, end in session.execute(ended) if begin and end
+    ]
+    return sum(seconds) / len(seconds) if seconds else 0.0
 
 
 def _count_by_map(session: Session, priorities: Sequence[Priority], limit: int) -> dict[str, int]:

@@ -122,6 +122,8 @@ class SearchStatus(_Message):
     """Whether some are unreadable only because a worker's cache is on a full disk."""
     lags: dict[UUID, ReplicationLag] = {}
     """Replication lag by generation; empty for a worker that does not follow the catalog."""
+    recalls: dict[UUID, float] = {}
+    """Measured recall of the generations that are searched by an approximate index"""
 
     @property
     def loaded(self) -> dict[UUID, int]:

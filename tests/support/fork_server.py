@@ -30,7 +30,6 @@ from shared.config.settings import Settings
 # imported by each process that needs it.
 MODULES = (
     "lab.cli.descriptors.describe_files",
-    "lab.cli.descriptors.fits",
     "services.extractor.service",
     "services.gateway.app",
     "services.search.service",

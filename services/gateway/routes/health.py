@@ -80,7 +80,8 @@ class QueueStatus(ComponentStatus):
 class ExtractorsStatus(ComponentStatus):
     """Whether photos can be described.
 
-    `degraded`: no extractor is alive, or a map's extractor can't be loaded.
+    `degraded`: no extractor is alive, a map's extractor can't be loaded, or a job waits much longer
+    than usual while none is finished.
     """
 
     processes: list[ExtractorProcess] = Field(description="extractors with a recent heartbeat")
@@ -183,7 +184,7 @@ def read_health(gateway: GatewayDep, admission: AdmissionDep, response: Response
     if has_catalog:
         depth = admission.queue_depth()
         components["queue"] = _check_messages(gateway, depth)
-        components["extractors"] = _check_extractors(gateway)
+        components["extractors"] = _check_extractors(gateway, depth)
         components |= _check_stewards(gateway)
     if components["object_store"].status == "healthy":
         components["object_store"] = _check_collection(gateway)
@@ -281,7 +282,10 @@ def _check_search(gateway: GatewayContext) -> ComponentStatus:
     if problems:
         return ComponentStatus(status="degraded", detail="; ".join(problems))
     place = "Milvus" if gateway.settings.search_engine == "milvus" else "memory"
-    return ComponentStatus(status="healthy", detail=f"{status.rows} rows in {place}")
+    detail = f"{status.rows} rows in {place}"
+    if status.recalls:
+        detail += f", recall of recent answers {min(status.recalls.values()):.3f}"
+    return ComponentStatus(status="healthy", detail=detail)
 
 
 def _check_messages(gateway: GatewayContext, depth: QueueDepth) -> QueueStatus:
@@ -299,7 +303,7 @@ def _check_messages(gateway: GatewayContext, depth: QueueDepth) -> QueueStatus:
     )
 
 
-def _check_extractors(gateway: GatewayContext) -> ExtractorsStatus:
+def _check_extractors(gateway: GatewayContext, depth: QueueDepth) -> ExtractorsStatus:
     with gateway.catalog.read() as session:
         extractors = [p for p in list_processes(session) if p.role == "extractor"]
         used = {*list_extractors_in_use(session), gateway.settings.local_features}
@@ -328,6 +332,12 @@ def _check_extractors(gateway: GatewayContext) -> ExtractorsStatus:
             for name, code in process.errors.items()
         }
     )
+    if live and depth.is_stalled:
+        problems.append(
+            f"no job has finished in the last minute, and one has waited for "
+            f"{depth.oldest_seconds:.0f} s (usual: {depth.usual_seconds:.0f} s). Read the "
+            "extractors' logs, and restart them"
+        )
     # Extractors that are scaled to zero while no job is queued unregister when they stop.
     if not live and (extractors or overdue):
         problems.append("no extractor is running: photos are stored, but not described")

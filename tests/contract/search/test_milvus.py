@@ -248,9 +248,15 @@ class TestSearchOnMilvus(SearchPortContract):
         complete(worker)
         assert len(collections(worker)) == 1
 
-    def test_answers_of_an_approximate_index_say_so(
-        self, places: SmallMap, catalog: Catalog, store: FolderStore, on_milvus: Settings
+    def test_answers_of_an_approximate_index_say_so_and_its_recall_is_measured(
+        self,
+        places: SmallMap,
+        catalog: Catalog,
+        store: FolderStore,
+        on_milvus: Settings,
+        monkeypatch: pytest.MonkeyPatch,
     ) -> None:
+        monkeypatch.setattr(milvus_module, "CHECK_SECONDS", 0.0)
         approximate = on_milvus.model_copy(update={"milvus_index": "HNSW"})
         worker = MilvusWorker(catalog, store, approximate, max_wait_seconds=60)
         places.add(unit_rows(1, 300))
@@ -259,6 +265,8 @@ class TestSearchOnMilvus(SearchPortContract):
         assert response.certificate == "approximate"
         exact = places.brute_force(vector, 10)
         assert len({hit.photo_id for hit in response.hits} & {id_ for id_, _ in exact}) >= 5
+        worker.sync()
+        assert 0.5 <= worker.status().recalls[places.generation_id] <= 1
 
 
 @whatever_the_catalog

@@ -7,14 +7,17 @@ from typing import Any
 from uuid import UUID
 
 import pytest
+from sqlalchemy import update
 
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.maps import get_map
 from shared.catalog.processes import RegisteredProcess, process_heartbeat
+from shared.jobs import Job
 from shared.storage.trash import end_hold, write_hold
 from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import add_map, set_columns
 from tests.support.photos import photo_bytes
+from tests.support.waiting import wait_until
 
 ANYLOC = "anyloc-vits14:clusters=2,layer=0"
 
@@ -123,6 +126,26 @@ def test_health_says_that_redis_takes_no_messages(service: Service) -> None:
     part = service.json("GET", "/health", 503)["parts"]["queue"]
     assert part["status"] == "degraded"
     assert "Timeout reading from socket" in part["detail"]
+
+
+def test_extractors_are_degraded_while_a_job_waits_much_longer_than_usual(
+    service: Service,
+) -> None:
+    register(service, device="cpu", models=["test-tiny-avg"], errors={})
+    (photo,) = service.indexed(1)
+    job_id = UUID(service.upload(photo_bytes(2))["job_id"])
+    set_columns(service.catalog, job_id, created_at=db_now_plus(-3600))
+    assert extractors(service, 200)["status"] == "healthy", "a job has just finished"
+    with service.catalog.write() as session:
+        session.execute(
+            update(Job).where(Job.photo_id == UUID(photo)).values(finished_at=db_now_plus(-120))
+        )
+    # The queue is measured every second, or less often.
+    wait_until(lambda: not service("GET", "/health").is_success, 60)
+    part = extractors(service, 503)
+    assert part["status"] == "degraded"
+    assert "waited for 36" in part["detail"]
+    assert "usual" in part["detail"]
 
 
 @pytest.fixture
