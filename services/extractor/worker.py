@@ -225,7 +225,7 @@ class ExtractorWorker:
                 self._run(batch, concurrent_jobs=0)
         elif _is_query(batch):
             self._run(batch)
-        elif self._run_stage(batch, "prepare"):
+        elif self._run_stage(batch):
             self._describing.wait()
             if self._stop.is_set():
                 self._runner.requeue(batch)
@@ -239,13 +239,13 @@ class ExtractorWorker:
 
     def _publish(self, batch: JobBatch) -> None:
         with batch.lease:
-            self._run_stage(batch, "publish")
+            self._run_stage(batch)
 
     def _run(self, batch: JobBatch, concurrent_jobs: int = 1) -> None:
         """Run all stages of a batch in this thread."""
         with batch.lease:
-            if self._run_stage(batch, "prepare") and self._describe(batch, concurrent_jobs):
-                self._run_stage(batch, "publish")
+            if self._run_stage(batch) and self._describe(batch, concurrent_jobs):
+                self._run_stage(batch)
 
     def _describe(self, batch: JobBatch, concurrent_jobs: int = 1) -> bool:
         """Run the stage that needs the model; of `concurrent_jobs`, any may cause a crash, too."""
@@ -256,13 +256,11 @@ class ExtractorWorker:
                 mark_started(session, batch.token, len(batch.jobs) + concurrent_jobs)
             self._runner.report_started(batch)
 
-        return self._run_stage(batch, "describe", mark_jobs)
+        return self._run_stage(batch, mark_jobs)
 
-    def _run_stage(
-        self, batch: JobBatch, name: str, begin: Callable[[], None] = lambda: None
-    ) -> bool:
+    def _run_stage(self, batch: JobBatch, begin: Callable[[], None] = lambda: None) -> bool:
         """Run the batch's next stage; return whether one follows."""
-        with self._runner.step(batch, name):
+        with self._runner.step(batch):
             begin()
             if next(batch.stages, DONE) is not DONE:
                 return True

@@ -48,7 +48,7 @@ from shared.jobs.leases import get_lease_token, lock_leased_jobs, maintain_lease
 from shared.jobs.model_changes import abandon_generation
 from shared.jobs.transitions import cancel_batch_items, fail_job, requeue_job
 from shared.jobs.wakeups import Wakeups, read_job_messages, report_jobs
-from shared.telemetry.tracing import request_id_context, span
+from shared.telemetry.request_ids import request_id_context
 
 log = logging.getLogger(__name__)
 
@@ -173,7 +173,7 @@ class JobRunner:
             return False
         job = claimed.jobs[0]
         self.report_started(claimed)
-        with claimed.lease, self.step(claimed, job.kind):
+        with claimed.lease, self.step(claimed):
             handler(job)
             log.info("step of %s job: done", job.kind, extra={"job_id": str(job.id)})
         self.report_ended(claimed)
@@ -239,14 +239,17 @@ class JobRunner:
         self.report_ended(claimed)
 
     @contextlib.contextmanager
-    def step(self, claimed: ClaimedJobs, name: str) -> Iterator[None]:
-        """Context manager that traces a step of the jobs and handles its exceptions.
+    def step(self, claimed: ClaimedJobs) -> Iterator[None]:
+        """Context manager that handles the exceptions of a step of the jobs.
 
         The jobs are updated as the module's table says. Only an error of that update is raised.
+        When all jobs come from one request, log lines carry its id, and jobs that the block creates
+        belong to it.
         """
         outcome, together = StepOutcome.DONE, len(claimed.jobs)
         jobs = f"{together} {claimed.kind} jobs (first: {claimed.jobs[0].id})"
-        with job_trace_context(claimed.jobs, name):
+        ids = distinct_request_ids(claimed.jobs)
+        with request_id_context(ids[0] if len(ids) == 1 else None):
             try:
                 yield
             except JobInterrupted:
@@ -343,28 +346,6 @@ def _fail_for_good(session: Session, job: Job, problem: dict[str, Any]) -> None:
     fail_job(job, problem)
     abandon_generation(session, job)
     cancel_batch_items(session, job)
-
-
-@contextlib.contextmanager
-def job_trace_context(jobs: Sequence[Job], step: str) -> Iterator[None]:
-    """Run the block in a span that links to the traces of the jobs' requests.
-
-    When all jobs come from one request, log lines carry its id, and jobs that the block creates
-    belong to it.
-    """
-    ids = distinct_request_ids(jobs)
-    with (
-        request_id_context(ids[0] if len(ids) == 1 else None),
-        span(
-            step,
-            [job.traceparent for job in jobs],
-            kind=str(jobs[0].kind),
-            jobs=len(jobs),
-            job_id=str(jobs[0].id) if len(jobs) == 1 else None,
-            request_ids=ids,
-        ),
-    ):
-        yield
 
 
 def distinct_request_ids(jobs: Sequence[Job]) -> list[str]:
