@@ -178,9 +178,9 @@ def index(
         if photos and anyloc is None:
             photos, headers = add_local_headers(photos, time_zone)
             sidecars = len({path for photo in photos for path in photo.sidecars})
-            others = sum(
-                (count_other_files(each.path) for each in opened), Counter[str]()
-            ) - Counter({".xmp": sidecars})
+            read = Counter(each.table.suffix for each in opened if each.table)
+            read[".xmp"] = sidecars
+            others = sum((count_other_files(each.path) for each in opened), Counter[str]()) - read
             about_sources = {
                 "other_files": others.total(),
                 "other_suffixes": dict(others.most_common()),
