@@ -6,8 +6,8 @@
   three standard deviations, and within the regions of 68 and 95 %.
 - Coverage of radii is that of queries by other lenses, each of which is a little off its middle and
   distorts, as those of telephones and cameras do.
-- Streets whose facades repeat, 56 photos each with exact coordinates: horizontal distance of
-  cameras and left-out queries from the truth.
+- Streets whose facades repeat, 56 photos each with exact coordinates, beside plain pycolmap with
+  SIFT: horizontal distance of cameras and left-out queries from the truth.
 - A generated city (`lab/city/round_trip.py`), whose camera poses are known: a drive of one summer
   day is the map; queries of a spring and an autumn day, of winter and night are localised without
   knowing their focal length. Coverage is also that with coordinates that are 3 m off.
@@ -42,6 +42,7 @@ from rich.progress import Progress
 from scipy.stats import binomtest
 
 from lab.benchmarks.matches import detect_all
+from lab.benchmarks.pose_peer import PeerModel, cpu_seconds
 from lab.benchmarks.report import Report, printed_report
 from lab.city.camera import Camera as CityCamera
 from lab.city.plan import PlannedPhoto
@@ -51,9 +52,10 @@ from lab.city.write import write_city
 from services.cli.output import JsonOption, Table
 from services.extractor.geometry.calibrate import ComponentPhotos, calibrate, localise_left_out
 from services.extractor.geometry.evidence import fit_to_positions
-from services.extractor.geometry.mapping import PhotoToMap, map_photos, require_pycolmap
+from services.extractor.geometry.mapping import map_photos
 from services.extractor.geometry.matching import match_pairs
 from services.extractor.geometry.pairs import choose_pairs
+from services.extractor.geometry.pycolmap_models import PhotoToMap, require_pycolmap
 from shared.errors import Unprocessable
 from shared.geometry.absolute_pose import estimate_absolute_pose
 from shared.geometry.cameras import Camera, CameraSource, Floats
@@ -123,9 +125,10 @@ class MappedPhotos:
         latitudes, longitudes, _ = _coordinates(
             np.full((len(features), 3), np.nan) if positions is None else positions
         )
-        started = time.perf_counter()
-        pairs = choose_pairs(self.vlad.rows, seconds, latitudes, longitudes)
-        matches = match_pairs(self.features, pairs, self.matcher, lambda _: None)
+        started, started_cpu = time.perf_counter(), cpu_seconds()
+        self.pairs = choose_pairs(self.vlad.rows, seconds, latitudes, longitudes)
+        matches = match_pairs(self.features, self.pairs, self.matcher, lambda _: None)
+        self.match_seconds = time.perf_counter() - started
         photos = [
             PhotoToMap(
                 photo,
@@ -139,6 +142,7 @@ class MappedPhotos:
         with TemporaryDirectory(prefix="placewise-bench-") as folder:
             mapped = map_photos(photos, matches, Path(folder), lambda _: None, lambda: None)
         self.seconds_taken = time.perf_counter() - started
+        self.cpu_seconds = cpu_seconds() - started_cpu
         self.components = [each.component for each in mapped]
         self.pose_seconds: list[float] = []
 
@@ -250,8 +254,8 @@ def measure_synthetic(report: Report) -> None:
 
 
 def measure_streets(report: Report, count: int, progress: Progress) -> list[tuple[str, int, int]]:
-    """Report streets whose facades repeat; return wrong poses."""
-    columns = ("street", "photos", "m", "over 3 m", "poses", "m")
+    """Report streets whose facades repeat, beside plain pycolmap with SIFT; return wrong poses."""
+    columns = ("street", "photos", "m", "over 3 m", "poses", "m", "CPU s")
     table, detector = Table(*columns, title="streets"), load_detector("xfeat", torch.device("cpu"))
     wrong = tried = 0
     for seed in STREETS[:count]:
@@ -277,33 +281,48 @@ def measure_streets(report: Report, count: int, progress: Progress) -> list[tupl
             features, _ = detect_all(detector, paths, partial(progress.advance, bar))
             seconds = 2.0 * np.arange(len(photos), dtype=np.float64)
             mapped = MappedPhotos(features[: len(photos)], detector.model, seconds, truth)
+            names = [str(path.relative_to(folder)) for path in paths]
+            asked = features[len(photos) :]
+            best = zip(names[len(photos) :], map(mapped.best, asked), strict=True)
+            peer = PeerModel(folder, names[: len(photos)], mapped.pairs, list(best))
         alignment, component = _align(mapped, truth), mapped.components[0]
         calibration = mapped.calibrate(0, alignment)
+        outcomes = [mapped.localise(query) for query in asked]
+        posed = [
+            p.position if isinstance(p, LocalPose) and not p.component else None for p in outcomes
+        ]
         judged = np.array(
             [
                 _judge(pose, alignment, calibration, place, query.camera.yaw)
-                for photo, place, query in zip(
-                    features[len(photos) :], true_queries, queries, strict=True
-                )
+                for photo, place, query in zip(asked, true_queries, queries, strict=True)
                 for pose in [mapped.localise_by_another_lens(photo, query.camera)]
                 if isinstance(pose, LocalPose) and not pose.component
             ]
         )
         rows = [mapped.ids.index(photo) for photo in component.photo_ids]
         turns = [component.rotation(row) for row in range(len(rows))]
-        fitted = fit_to_positions(component.centres(), turns, truth[rows])
-        assert fitted is not None
-        off = np.linalg.norm((fitted.apply(component.centres()) - truth[rows])[:, :2], axis=1)
-        far = int(np.sum(off > FAR_M))
-        table.add_row(
-            str(seed),
-            f"{len(rows)} of {len(photos)}",
-            f"{np.median(off):.2f}",
-            str(far),
-            f"{len(judged)} of {len(queries)}",
-            f"{np.median(judged[:, 0]):.2f}",
-        )
-        report.add(f"street {seed}: photos at a wrong place", far, at_most=0)
+        ours = (rows, component.centres(), turns, posed, mapped.cpu_seconds)
+        theirs = (peer.rows, peer.centres, peer.rotations, peer.positions, peer.cpu_seconds)
+        for what, (rows, centres, turns, found, cpu) in (
+            (str(seed), ours),
+            ("pycolmap, SIFT", theirs),
+        ):
+            fitted = fit_to_positions(centres, turns, truth[rows])
+            assert fitted is not None
+            has_pose = [n for n, position in enumerate(found) if position is not None]
+            places = np.array([found[n] for n in has_pose]).reshape(-1, 3)
+            off, errors = (
+                np.linalg.norm((fitted.apply(own) - true)[:, :2], axis=1)
+                for own, true in ((centres, truth[rows]), (places, true_queries[has_pose]))
+            )
+            counts = f"{len(rows)} of {len(photos)}", f"{len(has_pose)} of {len(queries)}"
+            middles = f"{np.median(off):.2f}", f"{np.median(errors):.2f}"
+            far = int(np.sum(off > FAR_M))
+            table.add_row(
+                what, counts[0], middles[0], str(far), counts[1], middles[1], f"{cpu:.0f}"
+            )
+            if what == str(seed):
+                report.add(f"street {seed}: photos at a wrong place", far, at_most=0)
         _add_coverage(report, f"street {seed}", *judged.T[:3])
         _add_coverage(report, f"street {seed}, heading", *judged.T[3:])
         wrong += int(np.sum(judged[:, 0] > WRONG_RADII * judged[:, 2]))

@@ -40,6 +40,18 @@ class VerifiedMatches:
         keypoints = tuple(self.keypoints[n] for n in np.flatnonzero(chosen).tolist())
         return VerifiedMatches(self.photo_ids, self.pairs[chosen], keypoints)
 
+    def joined(self, other: VerifiedMatches) -> VerifiedMatches:
+        """Return the matches of both, those of `other` as far as its photos are among these."""
+        numbers = {id_: number for number, id_ in enumerate(self.photo_ids)}
+        known = np.array([numbers.get(id_, -1) for id_ in other.photo_ids], np.int32)
+        pairs = known[other.pairs]
+        is_here = pairs.min(axis=1, initial=0) >= 0
+        return VerifiedMatches(
+            self.photo_ids,
+            np.concatenate([self.pairs, pairs[is_here]]),
+            (*self.keypoints, *other.only(is_here).keypoints),
+        )
+
     def encode(self) -> bytes:
         """Encode as a compressed npz."""
         buffer = io.BytesIO()
