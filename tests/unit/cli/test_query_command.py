@@ -187,7 +187,13 @@ def test_an_answer_without_levels_has_neither_bars_nor_match_probabilities(tmp_p
 
 def test_matched_photos_have_their_points_and_the_others_a_reason(tmp_path: Path) -> None:
     place: dict[str, Any] = {"headline": "No place.", "reason": "No place is known."}
-    counts = {"compared": 2, "missing": 1, "reason": None, "query_width": 4, "query_height": 3}
+    counts: dict[str, Any] = {
+        "compared": 2,
+        "missing": 1,
+        "reason": None,
+        "query_width": 4,
+        "query_height": 3,
+    }
     shown, _ = query(tmp_path, place, pose={"matches": counts}, inliers=57)
     assert "2 photos were matched; 1 have no local features." in shown.splitlines()
     header, row = (line.split() for line in shown.splitlines()[:3:2])
