@@ -18,7 +18,7 @@ INSTALLED := $(VENV)/.installed
 INSTALL := VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-lab test-chaos test-fast test-numerics test-deploy test-images test-browser test-api-fuzz pictures api-page lint size types bench demo env clean
+.PHONY: help setup run test test-lab test-chaos test-fast test-numerics test-deploy test-images test-browser test-api-fuzz pictures api-page lint size types bench env clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
@@ -95,9 +95,6 @@ types: $(INSTALLED) ## check types with mypy (strict)
 
 bench: $(INSTALLED) ## measure CPU time per photo and upload throughput
 	$(BIN)/placewise bench pipeline
-
-demo: $(INSTALLED) ## generate a city, index it, fit a vocabulary, search, print recall, write docs/demo.jpg
-	$(BIN)/python -m lab.demo --picture docs/demo.jpg
 
 env: ## write .env for docker compose with new secrets (an existing one is kept)
 	@test ! -e .env || { echo ".env exists already"; exit 1; }

@@ -468,19 +468,15 @@ class AsyncClient(AsyncTransport):
         generation_id: Id,
         file: BinaryIO,
         on_received: Callable[[int], object] = lambda received_bytes: None,
-        *,
-        features: bool = False,
     ) -> None:
         """Download a tar with `descriptors.npy`, `names.txt` and `photos.csv` into a file.
-
-        With `features`, the tar also has the local features, `local.features`.
 
         Args:
             file: Seekable and writable; overwritten from its beginning.
             on_received: Called with the number of bytes received so far.
         """
         path = f"/generations/{generation_id}/descriptors"
-        await self._download(path, file, on_received, **({"features": True} if features else {}))
+        await self._download(path, file, on_received)
 
     async def reconstruct(self, *, from_scratch: bool = False) -> answers.Started:
         """Start reconstructing the map's photos, or registering new ones into its reconstruction.
@@ -658,7 +654,7 @@ class AsyncClient(AsyncTransport):
             name: Owner or purpose.
             scopes: `read`, `write`, `admin`.
             limits: The optional fields of `POST /keys`: `maps`, `days`, `requests_per_minute`,
-                `upload_bytes_per_day`, `max_photos`.
+                `max_photos`.
         """
         body = {"name": name, "scopes": list(scopes), **drop_none(**limits)}
         return answers.CreatedKey(**await self._call("POST", "/keys", json=body))

@@ -27,7 +27,7 @@ from placewise.protocol import (
     response_error,
     validate_url,
 )
-from shared.errors import Conflict, TooManyRequests, Unavailable
+from shared.errors import TooManyRequests, Unavailable
 from shared.ids import new_id
 
 PAGE_SIZE = 1000  # the server's maximum
@@ -169,7 +169,7 @@ class AsyncTransport:
                 return
 
     async def _download(
-        self, path: str, file: BinaryIO, on_received: Callable[[int], object], **params: bool
+        self, path: str, file: BinaryIO, on_received: Callable[[int], object]
     ) -> None:
         """Stream a response into a file, which is truncated before each attempt."""
 
@@ -180,7 +180,7 @@ class AsyncTransport:
         async def attempt() -> None:
             file.seek(0)
             file.truncate()
-            await self._check(self._receive(f"{API}{path}", write, params=params))
+            await self._check(self._receive(f"{API}{path}", write))
 
         await self._retry(attempt)
 
@@ -214,7 +214,7 @@ class AsyncTransport:
         while True:
             try:
                 return await call()
-            except (Unavailable, TooManyRequests, Conflict) as error:
+            except (Unavailable, TooManyRequests) as error:
                 is_late = time.monotonic() >= deadline
                 await self._sleep(self._patience.wait_seconds(error, attempt, is_late))
                 attempt += 1

@@ -16,7 +16,6 @@ from typing import Any, BinaryIO
 import httpx2
 
 from shared.errors import (
-    Conflict,
     InvalidRequest,
     PlacewiseError,
     TooManyRequests,
@@ -58,7 +57,8 @@ class RetryPolicy:
         Raises:
             PlacewiseError: `error` itself, if it is not retryable or the retry period is over.
         """
-        if not self.seconds or not _is_retryable(error, deadline_passed):
+        is_full = isinstance(error, TooManyRequests)
+        if not self.seconds or (deadline_passed and not is_full):
             raise error
         retry_after = error.extra.get("retry_after_seconds")
         if retry_after is None:
@@ -69,15 +69,6 @@ class RetryPolicy:
             seconds = min(max(float(retry_after), INITIAL_BACKOFF_SECONDS), MAX_RETRY_AFTER_SECONDS)
         self.on_wait(error, seconds)
         return seconds
-
-
-def _is_retryable(error: PlacewiseError, deadline_passed: bool) -> bool:
-    """Whether a retry may succeed."""
-    if isinstance(error, TooManyRequests):
-        return True
-    if isinstance(error, Conflict):  # our earlier attempt, whose response was lost, still runs
-        return error.code == "idempotency_key_in_use" and not deadline_passed
-    return not deadline_passed
 
 
 def validate_url(url: str, key: str | None) -> str:

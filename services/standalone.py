@@ -29,7 +29,6 @@ from services.gateway.dependencies import GatewayContext
 from services.gateway.proxy_sign_in import with_proxy_sign_in
 from services.http_server import http_server, lan_url, listen, reachable_url, stop_on_signals
 from services.search.metrics import MeteredSearch
-from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
 from services.service_process import start_service_threads, stop_when_a_thread_crashes
 from services.steward.batches.worker import BatchWorker
@@ -40,14 +39,13 @@ from services.steward.scheduler import Scheduler
 from services.steward.tasks.maintenance import reclaim_leases
 from services.steward.webhooks import WebhookDispatcher
 from shared.catalog.api_keys import create_api_key, has_admin_key
-from shared.catalog.database.schema import migrate, sqlite_file
+from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import REQUEST_TIMEOUTS, Catalog
 from shared.catalog.generations import RowType
 from shared.catalog.installation import check_before_new_catalog, open_installation_store
 from shared.catalog.maps import get_or_create_default_map
-from shared.catalog.processes import delete_dead_search_workers, delete_processes
+from shared.catalog.processes import delete_processes, process_heartbeat
 from shared.catalog.tables import open_catalog
-from shared.config.disk_space import DiskReserve
 from shared.config.embedded_home import announce_server, lock_home
 from shared.config.settings import Settings
 from shared.errors import Misconfigured, PlacewiseError
@@ -140,8 +138,6 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         listener = stack.enter_context(listen(settings.host, settings.port))
         catalog = open_catalog(settings, "embedded")
         stack.callback(catalog.close)
-        if (file := sqlite_file(catalog)) is not None:
-            DiskReserve(file.parent, settings.min_free_bytes).release()
         check_before_new_catalog(catalog, settings)
         migrate(catalog)
         store = open_installation_store(catalog, settings, exclusive=True)
@@ -153,8 +149,7 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         if settings.database_url is None:
             # The lock proves that no other worker is alive: rows are left from a killed process.
             with catalog.write() as session:
-                delete_dead_search_workers(session, all_workers=True)
-                delete_processes(session, "extractor")
+                delete_processes(session)
             reclaim_leases(catalog, wakeups, all_leases=True)
 
         registry = CollectorRegistry()  # shared: /metrics has the metrics of all services
@@ -168,7 +163,6 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         stack.enter_context(announce_server(home, url, local_key))
 
         search = SearchWorker.from_settings(catalog, store, settings)
-        heartbeat = WorkerHeartbeat(catalog, search, name)
         steward_metrics = StewardMetrics(registry)
         steward = Scheduler(catalog, store, wakeups, settings, steward_metrics)
         evaluator = EvaluationWorker(catalog, search, settings, name, steward_metrics)
@@ -201,11 +195,11 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         stack.enter_context(stop_when_a_thread_crashes(running.stop))
         catalog.commits.announce = extractor.look
         extractor.look()
+        stack.enter_context(process_heartbeat(catalog, "search", search.state))
         threads = start_service_threads(
             {
                 "search": search.run,
                 "search of building generations": search.run_building,
-                "search heartbeat": heartbeat.run,
                 "extractor process": run_extractor,
                 "steward": steward.run,
                 "evaluator": evaluator.run,

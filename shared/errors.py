@@ -10,7 +10,6 @@ PlacewiseError
 ├── RequestTimeout 408          request_too_slow
 ├── Conflict 409                not_searchable, photo_differs, model_change_running, ...
 ├── Gone 410                    query_expired
-├── LengthRequired 411          length_required
 ├── TooLarge 413                file_too_large, batch_too_large, ...
 ├── UnsupportedMedia 415        unsupported_photo, unsupported_body
 ├── Unprocessable 422           invalid_field, undecodable_photo, too_many_pixels, ...
@@ -110,11 +109,6 @@ class Gone(PlacewiseError):
     title = "No longer available"
 
 
-class LengthRequired(PlacewiseError):
-    status = 411
-    title = "Content-Length is required"
-
-
 class TooLarge(PlacewiseError):
     status = 413
     title = "Too large"
@@ -182,7 +176,6 @@ _ERRORS_BY_STATUS: dict[int, type[PlacewiseError]] = {
         RequestTimeout,
         Conflict,
         Gone,
-        LengthRequired,
         TooLarge,
         UnsupportedMedia,
         Unprocessable,

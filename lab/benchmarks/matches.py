@@ -1,11 +1,11 @@
 """Matches of local features: their cost, and what they add to place estimates.
 
-    placewise bench matches [FOLDER...] [--detector xfeat] [--lightglue]
+    placewise bench matches [FOLDER...] [--detector xfeat]
 
 Each folder is an evaluation set with coordinates or place labels; without one, it is the folder
 `tower` of PLACEWISE_TEST_DATA. Its descriptors and place models are those of `bench estimates`. The
-queries are estimated without matches, and with those of their first photos. Matched are mutual
-nearest neighbours, or LightGlue's matches. CPU times are those of one thread.
+queries are estimated without matches, and with those of their first photos. CPU times are those of
+one thread.
 """
 
 from __future__ import annotations
@@ -35,8 +35,7 @@ from services.cli.output import JsonOption
 from shared.evaluation.places.evidence import match_support
 from shared.matching.detectors import Detector, load_detector
 from shared.matching.features import WORKING_SIDE, LocalFeatures
-from shared.matching.lightglue import LightGlueMatcher
-from shared.matching.matchers import Matcher, MutualNearest
+from shared.matching.matchers import MutualNearest
 from shared.matching.verification import verify_matches
 
 MAX_FEATURES_MS = 70.0
@@ -47,7 +46,7 @@ MAX_XFEAT_BYTES = 80_000
 class MatchedPhotos:
     """Local features of the photos of a set, and the match support of pairs, each computed once."""
 
-    def __init__(self, features: Callable[[int], LocalFeatures], matcher: Matcher) -> None:
+    def __init__(self, features: Callable[[int], LocalFeatures], matcher: MutualNearest) -> None:
         self.features = features
         self.matcher = matcher
         self.match_seconds = self.verify_seconds = 0.0
@@ -76,18 +75,13 @@ class MatchedPhotos:
 def bench(
     folders: Folders = None,
     detector: Annotated[str, typer.Option(help="xfeat or aliked-n16.")] = "xfeat",
-    lightglue: Annotated[bool, typer.Option(help="Match with LightGlue.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Measure the cost of local features, and what their matches add to place estimates."""
     measured = evaluation_folders(folders)
-    device = torch.device("cpu")
-    loaded = load_detector(detector, device)
-    matcher: Matcher = MutualNearest.of_model(loaded.model)
-    if lightglue:
-        matcher = LightGlueMatcher(detector, device)
-    name = f"{loaded.model}, {'LightGlue' if lightglue else 'mutual nearest'}"
-    with printed_report(f"matches of {name}", as_json) as (report, progress):
+    loaded = load_detector(detector, torch.device("cpu"))
+    matcher = MutualNearest.of_model(loaded.model)
+    with printed_report(f"matches of {loaded.model}", as_json) as (report, progress):
         for photos in describe_sets(measured, progress):
             bar = progress.add_task(f"{photos.name}: local features", total=len(photos.paths))
             features, seconds = detect_all(loaded, photos.paths, partial(progress.advance, bar))

@@ -52,9 +52,10 @@ from lab.city.write import write_city
 from services.cli.output import JsonOption, Table
 from services.extractor.geometry.calibrate import ComponentPhotos, calibrate, localise_left_out
 from services.extractor.geometry.evidence import fit_to_positions
-from services.extractor.geometry.mapping import PhotoToMap, map_photos, require_pycolmap
+from services.extractor.geometry.mapping import map_photos
 from services.extractor.geometry.matching import match_pairs
 from services.extractor.geometry.pairs import choose_pairs
+from services.extractor.geometry.pycolmap_models import PhotoToMap, require_pycolmap
 from shared.errors import Unprocessable
 from shared.geometry.absolute_pose import estimate_absolute_pose
 from shared.geometry.cameras import Camera, CameraSource, Floats

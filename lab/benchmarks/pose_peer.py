@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.extractor.geometry.mapping import RANDOM_SEED, require_pycolmap
+from services.extractor.geometry.pycolmap_models import RANDOM_SEED, require_pycolmap
 from shared.geometry.cameras import Floats
 
 FEATURES, LONGER_SIDE = 4096, 1600

@@ -42,7 +42,7 @@ from lab.benchmarks.synthetic_map import (
     required_memory_bytes,
 )
 from services.cli.output import JsonOption, Table
-from services.search.executor import SearchOptions, execute_query
+from services.search.executor import execute_query
 from services.search.sign_code_search import SignCodeBlocks, SignCodedQuery, scan_first_level
 from services.search.snapshot import Snapshot
 from services.search.worker import SearchWorker
@@ -190,8 +190,7 @@ def placewise_search(worker: SearchWorker, snapshot: Snapshot) -> SearchMethod:
     """Return Placewise's search on the loaded snapshot, called directly."""
 
     def search(query: Row, k: int) -> Ranking:
-        options, findable = SearchOptions(k), snapshot.photos.findable
-        found = execute_query(snapshot, query, findable, options, worker.query_batcher)
+        found = execute_query(snapshot, query, snapshot.photos.findable, k, worker.query_batcher)
         return [(hit.photo_id, hit.score) for hit in found.hits]
 
     return search

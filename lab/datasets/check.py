@@ -1,12 +1,8 @@
-"""Dataset checks: what a folder contains, undecodable photos, and suspect ground truth labels.
+"""Dataset checks: what a folder contains, and undecodable photos.
 
 `inspect_dataset` opens every set in a folder and collects problems, for `placewise datasets check`.
 
 `find_undecodable_photos` decodes every photo completely, on all cores.
-
-`find_suspect_labels` lists confident first matches that the ground truth counts as wrong although
-they are close: a match 30 m away, or at the right position with another heading, often shows the
-place. Such labels should be reviewed; in published sets they have invalidated whole results.
 """
 
 from __future__ import annotations
@@ -19,25 +15,16 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from lab.datasets.dataset import DatasetPhoto, EvaluationSet, Indices, TrainingSet
-from lab.datasets.ground_truth import (
-    PositiveRule,
-    find_positives,
-    heading_differences,
-    parse_rule,
-)
+from lab.datasets.dataset import EvaluationSet, TrainingSet
+from lab.datasets.ground_truth import PositiveRule, find_positives
 from lab.datasets.open_dataset import (
     find_evaluation_sets,
     find_training_layout,
     open_evaluation_set,
     open_training_set,
 )
-from lab.datasets.utm_coordinates import has_position, pairwise_distances_m
-from lab.evaluation.recall import compute_hits
-from shared.errors import InvalidRequest, NotFound, PlacewiseError, Unprocessable
+from lab.datasets.utm_coordinates import has_position
+from shared.errors import NotFound, PlacewiseError, Unprocessable
 from shared.imaging.file_formats import PHOTO_READ_ERRORS, check_pixel_count
 from shared.imaging.file_structure import open_photo
 
@@ -197,101 +184,3 @@ def _problem(code: str, examples: Sequence[str], what: str) -> DatasetProblem:
     return DatasetProblem(
         code, len(examples), f"{len(examples)} {what}.", tuple(examples[:MAX_EXAMPLES])
     )
-
-
-MAX_RULE_MULTIPLE = 4.0
-"""Matches within this multiple of the rule's distance count as suspect."""
-
-
-@dataclass(frozen=True, slots=True)
-class SuspectLabel:
-    """A query whose confident first match is not a positive."""
-
-    query: int
-    """Index of the query"""
-    database: int
-    """Index of the match"""
-    query_name: str
-    database_name: str
-    score: float | None
-    metres: float | None
-    """Distance of query and match; None if one has no position"""
-    degrees: float | None
-    """Difference of their headings, 0 to 180; None if one has no heading"""
-
-
-def find_suspect_labels(
-    evaluation: EvaluationSet,
-    ranked: Indices,
-    scores: NDArray[np.float32] | None = None,
-) -> list[SuspectLabel]:
-    """Find confident first matches that are not positives but lie just outside the set's rule.
-
-    "Just outside" means within MAX_RULE_MULTIPLE times the metres or frames of the rule, for any
-    heading; 25 m if the rule is unknown or `place-label`.
-
-    Args:
-        ranked: (queries, k) database indices, best first.
-        scores: (queries, k) scores, higher is better: a confident match has at least the median of
-            the first matches that are positives. None treats every first match as confident.
-
-    Returns the suspects, most confident first. Raises InvalidRequest
-    (`predictions_of_other_queries`).
-    """
-    if len(ranked) != len(evaluation.queries) or (
-        scores is not None and len(scores) != len(ranked)
-    ):
-        raise InvalidRequest(
-            "predictions_of_other_queries",
-            f"There are {len(ranked)} predictions for {len(evaluation.queries)} queries"
-            + ("." if scores is None else f", with {len(scores)} rows of scores."),
-        )
-    if not ranked.size:
-        return []
-    first = ranked[:, 0]
-    correct = compute_hits(ranked[:, :1], evaluation.positives)[:, 0]
-    confident = ~correct
-    if scores is not None:
-        min_score = float(np.median(scores[correct, 0])) if correct.any() else -np.inf
-        confident &= scores[:, 0] >= min_score
-    candidates = np.flatnonzero(confident).tolist()
-    pairs = [(evaluation.queries[n], evaluation.database[first[n]]) for n in candidates]
-    metres = pairwise_distances_m([query for query, _ in pairs], [match for _, match in pairs])
-    rule = _rule_of(evaluation)
-    suspects = [
-        SuspectLabel(
-            number,
-            int(first[number]),
-            query.name,
-            match.name,
-            None if scores is None else float(scores[number, 0]),
-            None if np.isnan(distance) else distance,
-            _degrees(query, match),
-        )
-        for number, (query, match), distance in zip(candidates, pairs, metres.tolist(), strict=True)
-        if _is_just_outside(rule, query, match, distance)
-    ]
-    return sorted(suspects, key=lambda suspect: (-(suspect.score or 0.0), suspect.query))
-
-
-def _is_just_outside(
-    rule: PositiveRule, query: DatasetPhoto, match: DatasetPhoto, metres: float
-) -> bool:
-    if rule.kind == "frames":
-        if query.frame is None or match.frame is None:
-            return False
-        return abs(query.frame - match.frame) <= MAX_RULE_MULTIPLE * max(rule.frames, 1)
-    return metres <= MAX_RULE_MULTIPLE * rule.radius_m  # False for NaN
-
-
-def _rule_of(evaluation: EvaluationSet) -> PositiveRule:
-    try:
-        return parse_rule(evaluation.rule)
-    except InvalidRequest:  # a ground truth file without a known rule
-        return PositiveRule("radius")
-
-
-def _degrees(query: DatasetPhoto, match: DatasetPhoto) -> float | None:
-    if query.heading is None or match.heading is None:
-        return None
-    return float(heading_differences(np.array([match.heading]), query.heading)[0])

@@ -12,7 +12,7 @@ import json
 import platform
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lab.datasets.check import SuspectLabel
 from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.evaluation.exact_knn import Indices, Rankings, Scores
 from lab.evaluation.paired_runs import PairedDifference, paired_differences
@@ -221,8 +220,6 @@ class EvaluationResult:
     """`dimension`, `describe_ms_per_photo`, ... as far as known"""
     against: RunComparison | None = None
     """comparison with an earlier run"""
-    suspects: tuple[SuspectLabel, ...] = ()
-    """confident first matches that count as wrong but are just outside the positive criterion"""
     places: dict[str, Any] | None = None
     """answers at the levels of places (`measure_places`)"""
 
@@ -250,7 +247,6 @@ class EvaluationResult:
             **self.about,
             **self.measured.as_json(),
             "against": self.against.as_json() if self.against else None,
-            "suspects": [asdict(suspect) for suspect in self.suspects],
             "places": self.places,
         }
 

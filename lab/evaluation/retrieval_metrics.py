@@ -1,13 +1,13 @@
 """Retrieval metrics of one evaluation set: recall@k, mAP@k, precision-recall, distance error.
 
-Also measures how well the score of the first match predicts whether it is correct: AUROC, recall
-at 99 % precision, and expected calibration error (ECE). Means have cluster-bootstrap intervals.
+Also measures how well the score of the first match tells whether it is correct: AUROC, and recall
+at 99 % precision. Means have cluster-bootstrap intervals.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,9 +26,6 @@ from shared.evaluation.bootstrap import (
     ConfidenceInterval,
     share_intervals,
 )
-from shared.evaluation.calibration import expected_calibration_error
-from shared.evaluation.places.fit import RegressionTable, fit_map_estimate
-from shared.evaluation.places.probability import PlacePrior, sigmoid
 
 
 def hits_at_k(hits: Hits, ks: Sequence[int]) -> NDArray[np.float64]:
@@ -128,73 +125,6 @@ def distance_error(metres: NDArray[np.float64]) -> dict[str, Any] | None:
     }
 
 
-TARGET_PRECISION = 0.99
-FOLDS = 5
-MIN_QUERIES_PER_CLASS = 8  # correct and wrong queries each; with fewer the slope is unreliable
-MIN_QUERIES = 40
-L2_PENALTY = 0.1  # on the standardised score; keeps the slope finite on separable data
-
-
-@dataclass(frozen=True, slots=True)
-class ScoreCalibration:
-    """How well the score of the first match predicts that it is correct."""
-
-    auroc: float | None
-    """P(a correct first match scores higher than a wrong one); None without both kinds"""
-    recall_at_99_precision: float
-    """recall at the score threshold above which 99 % of first matches are correct"""
-    calibration_error: float | None
-    """ECE of a logistic regression on the score, cross-validated by cluster; None with too few
-    queries, or too few correct or wrong ones, to fit it"""
-
-
-def calibrate_scores(
-    scores: NDArray[np.floating],
-    correct: NDArray[np.bool_],
-    queries_with_positive: int,
-    clusters: QueryClusters,
-) -> ScoreCalibration:
-    """Measure how well the (queries,) cosines of the first matches predict that they are correct.
-
-    A cluster is never split between the folds of the cross-validation.
-    """
-    values, target = scores.astype(np.float64).tolist(), correct.tolist()
-    confidence = _cross_validated_confidence(scores.astype(np.float64), correct, clusters)
-    return ScoreCalibration(
-        auroc=auroc(values, target),
-        recall_at_99_precision=recall_at_precision(
-            values, target, queries_with_positive, TARGET_PRECISION
-        ),
-        calibration_error=None
-        if confidence is None
-        else expected_calibration_error(confidence, target),
-    )
-
-
-def _cross_validated_confidence(
-    scores: NDArray[np.float64], correct: NDArray[np.bool_], clusters: QueryClusters
-) -> list[float] | None:
-    """Predict P(correct) by a logistic regression on the score (Platt 1999), cross-validated."""
-    fold = np.random.default_rng(0).permutation(int(clusters.labels.max(initial=-1)) + 1) % FOLDS
-    folds = fold[clusters.labels] if len(scores) else np.empty(0, np.int64)
-    predictions = np.zeros(len(scores))
-    for held_out in range(FOLDS):
-        known = folds != held_out
-        right = int(correct[known].sum())
-        wrong = int(known.sum()) - right
-        if right + wrong < MIN_QUERIES or min(right, wrong) < MIN_QUERIES_PER_CLASS:
-            return None
-        mean, scale = float(scores[known].mean()), float(scores[known].std())
-        standard = PlacePrior(means=(mean,), scales=(scale or 1.0,), level=(), missing_place=())
-        table = RegressionTable(
-            scores[known, None], correct[known].astype(np.float64), np.ones(right + wrong)
-        )
-        fitted = fit_map_estimate(table, (0.0, 0.0), standard, L2_PENALTY)
-        predictions[~known] = sigmoid(standard.design(scores[~known, None]) @ np.array(fitted))
-    probabilities: list[float] = predictions.tolist()
-    return probabilities
-
-
 MAX_CURVE_POINTS = 400  # points of a curve in metrics.json
 
 
@@ -217,8 +147,10 @@ class RetrievalMetrics:
     clusters: QueryClusters
     curve: PrecisionRecall | None
     """None without scores"""
-    calibration: ScoreCalibration | None
-    """None without scores"""
+    auroc: float | None
+    """P(a correct first match scores higher than a wrong one); None without scores or both kinds"""
+    recall_at_99_precision: float | None
+    """recall at the score threshold above which 99 % of first matches are correct"""
     metres: Distances | None
     """(queries, depth) distance of each ranked photo from its query; None if unknown"""
 
@@ -251,7 +183,8 @@ class RetrievalMetrics:
             },
             "recall_curve": self.recall_curve,
             "precision_recall": _curve_json(self.curve),
-            "calibration": asdict(self.calibration) if self.calibration else None,
+            "auroc": self.auroc,
+            "recall_at_99_precision": self.recall_at_99_precision,
             "distance_error": None if self.metres is None else distance_error(self.metres[:, 0]),
         }
 
@@ -271,7 +204,7 @@ def compute_metrics(
         ranked: (queries, depth) database indices, best first.
         positives: database indices of each query's positives.
         clusters: clusters of correlated queries, for the intervals.
-        scores: (queries, depth) cosines; None omits the precision-recall curve and the calibration.
+        scores: (queries, depth) cosines; None omits the figures of the first match's score.
         metres: (queries, depth) distances from the query; None omits the distance error.
         ks: the values of k; those beyond the depth are ignored.
     """
@@ -284,10 +217,12 @@ def compute_metrics(
     precisions = average_precisions(hits, positive_counts)[findable]
     findable_values = np.column_stack([within[findable], precisions])
     intervals = share_intervals(findable_values, clusters.labels[findable])
-    curve = calibration = None
+    curve = area = sure = None
     if scores is not None:
-        first = scores[:, 0], hits[:, 0], int(findable.sum())
-        curve, calibration = precision_recall(*first), calibrate_scores(*first, clusters)
+        curve = precision_recall(scores[:, 0], hits[:, 0], int(findable.sum()))
+        first, correct = scores[:, 0].astype(np.float64).tolist(), hits[:, 0].tolist()
+        area = auroc(first, correct)
+        sure = recall_at_precision(first, correct, int(findable.sum()), 0.99)
     return RetrievalMetrics(
         recalls=compute_recalls(ranked, positives, ks),
         hits=hits,
@@ -298,7 +233,8 @@ def compute_metrics(
         map_interval=intervals[-1] if intervals else None,
         clusters=clusters,
         curve=curve,
-        calibration=calibration,
+        auroc=area,
+        recall_at_99_precision=sure,
         metres=metres,
     )
 

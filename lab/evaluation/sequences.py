@@ -1,7 +1,7 @@
-"""Evaluation of tracks on data sets with sequences: single frames, SeqSLAM and the filter.
+"""Evaluation of tracks on data sets with sequences: single frames and the filter.
 
 A frame is right if the photo that it is matched to is a positive of the set's rule. Frames without
-positives were taken outside the map; there every answer is wrong. All methods use the same
+positives were taken outside the map; there every answer is wrong. Both use the same
 descriptors; the filter searches with the earlier frames as the background, as the API does.
 """
 
@@ -22,7 +22,6 @@ from lab.datasets.ground_truth import parse_rule
 from lab.evaluation.array_photo_graph import ArrayPhotoGraph
 from lab.evaluation.confidence_metrics import recall_at_precision
 from lab.evaluation.places import RANKS, SAMPLED_PHOTOS, measure_background
-from lab.evaluation.seqslam import seqslam_matches
 from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
 from shared.evaluation.places.fit import MapScores, fit_place_model
@@ -43,18 +42,11 @@ JUMP_M = 100.0
 """between two frames, from which on the camera was carried away"""
 NOTICE_FRAMES = 20
 """frames after which a track outside the map must be lost"""
-KIDNAPS = 6
-"""of a sequence"""
-FOUND_FRAMES = 40
-"""frames after which a track that was carried away must be right again"""
-SEQSLAM_CELL_M = 12.0
-STOPS = 4
-STOP_FRAMES = 30
 
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:
-    """What the methods answer for a frame."""
+    """What single frames and the filter answer for a frame."""
 
     query: int
     """index in the evaluation set"""
@@ -62,7 +54,6 @@ class FrameResult:
     is_start: bool
     """whether the track begins here: first frame, back in the map, or carried away"""
     single_is_right: bool
-    seqslam_is_right: bool
     filter_is_right: bool
     smoothed_is_right: bool
     single_score: float
@@ -81,11 +72,6 @@ class SequenceMap:
     scheme: LevelScheme
     judge: Callable[[NDArray[np.float32]], float | None]
     """returns the log-odds that the map lacks a frame's place, from its (n,) scores"""
-
-    @property
-    def has_coordinates(self) -> bool:
-        """Whether all photos have coordinates."""
-        return all(photo.latitude is not None for photo in self.photos)
 
 
 def prepare_map(evaluation_set: EvaluationSet, rows: Rows, motion: MotionModel) -> SequenceMap:
@@ -189,7 +175,6 @@ def evaluate_sequence(
         states.append(track_filter.state(belief))
     seconds = (time.process_time() - started) / max(len(evidence), 1)
     smoothed = track_filter.smoothed_states(evidence)
-    seqslam = _seqslam(map_, scores, motion)
     results = []
     for number, index in enumerate(members):
         positives = set(evaluation_set.positives[index].tolist())
@@ -199,7 +184,6 @@ def evaluate_sequence(
                 has_positive=bool(positives),
                 is_start=bool(positives) and _is_start(evaluation_set, members, number),
                 single_is_right=int(scores[number].argmax()) in positives,
-                seqslam_is_right=int(seqslam[number]) in positives,
                 filter_is_right=_photo(states[number].photo) in positives,
                 smoothed_is_right=_photo(smoothed[number].photo) in positives,
                 single_score=float(scores[number].max()),
@@ -208,63 +192,6 @@ def evaluate_sequence(
             )
         )
     return results, seconds
-
-
-def resample(members: Sequence[int]) -> dict[str, list[int]]:
-    """Return a sequence at other paces, with stops, and from its middle, by a title of each."""
-    count = len(members)
-    stops = {(2 * n + 1) * count // (2 * STOPS) for n in range(STOPS)}
-    frames = {
-        f"at {pace:g} of the pace": np.arange(0, count, pace).astype(int)
-        for pace in (0.5, 0.75, 1.5)
-    } | {
-        f"{STOPS} stops of {STOP_FRAMES} frames": np.repeat(
-            np.arange(count), [STOP_FRAMES if n in stops else 1 for n in range(count)]
-        ),
-        "from the middle": np.arange(count // 2, count),
-    }
-    return {title: [members[n] for n in numbers] for title, numbers in frames.items()}
-
-
-def evaluate_kidnapped(
-    map_: SequenceMap,
-    evaluation_set: EvaluationSet,
-    members: Sequence[int],
-    rows: Rows,
-    motion: MotionModel,
-    every: int,
-) -> list[int | None]:
-    """Evaluate relocalisation after jumps of the camera to random frames of its sequence.
-
-    Frames outside the map are left out. After its last frame, the sequence begins again.
-
-    Args:
-        members: Query indices in the order of frames.
-        rows: (len(members), D) descriptors of these queries, of unit length.
-        every: Number of frames between two jumps.
-
-    Returns:
-        For each of KIDNAPS jumps, the number of frames until the track has the status `tracking` at
-        a correct photo; None if that does not happen before the next jump.
-    """
-    inside = [n for n, index in enumerate(members) if len(evaluation_set.positives[index])]
-    if len(inside) < 2:
-        return []
-    starts = np.random.default_rng(0).integers(len(inside), size=KIDNAPS + 1).tolist()
-    frames = [inside[(start + n) % len(inside)] for start in starts for n in range(every)]
-    times = _times([evaluation_set.queries[members[n]] for n in frames])
-    evidence = _frames_of(map_, times, rows[frames] @ map_.rows.T)
-    track_filter = TrackFilter(map_.graph, motion, map_.scheme)
-    belief: Belief | None = None
-    found: list[int | None] = [None] * (KIDNAPS + 1)
-    for number, frame in enumerate(evidence):
-        belief = track_filter.advance(belief, frame)
-        segment, since = divmod(number, every)
-        if found[segment] is None and belief.status == "tracking":
-            photo = _photo(track_filter.state(belief).photo)
-            if photo in evaluation_set.positives[members[frames[number]]]:
-                found[segment] = since
-    return found[1:]  # before the first jump
 
 
 def _frames_of(map_: SequenceMap, times: Sequence[datetime], scores: Rows) -> list[FrameEvidence]:
@@ -318,16 +245,6 @@ def _is_start(evaluation_set: EvaluationSet, members: Sequence[int], number: int
     return bool(np.hypot(*(metres[1] - metres[0])) > JUMP_M)  # not for unknown ones, NaN
 
 
-def _seqslam(map_: SequenceMap, scores: Rows, motion: MotionModel) -> NDArray[np.int64]:
-    eastings = np.array([photo.easting for photo in map_.photos], dtype=np.float64)
-    northings = np.array([photo.northing for photo in map_.photos], dtype=np.float64)
-    if np.isnan(eastings).any():
-        line = np.arange(len(map_.photos), dtype=np.float64)[:, None]
-        return seqslam_matches(scores, line, 1.0, 1.0)
-    positions = np.stack([eastings, northings], axis=1)
-    return seqslam_matches(scores, positions, motion.typical_speed_mps, SEQSLAM_CELL_M)
-
-
 def _photo(photo: str | None) -> int:
     return -1 if photo is None else int(photo)
 
@@ -355,7 +272,7 @@ def sequence_figures(sequences: Sequence[Sequence[FrameResult]]) -> dict[str, An
         "frames_outside": len(frames) - len(inside),
         "recall": {
             name: _share([getattr(frame, f"{name}_is_right") for frame in inside])
-            for name in ("single", "seqslam", "filter", "smoothed")
+            for name in ("single", "filter", "smoothed")
         },
         "recall_at_99_precision": {
             name: recall_at_precision(
@@ -375,15 +292,6 @@ def sequence_figures(sequences: Sequence[Sequence[FrameResult]]) -> dict[str, An
         "frames_to_localise": localised,
         "frames_to_notice_lost": noticed,
         "claimed_outside": _share(claimed),
-    }
-
-
-def kidnapping_figures(found: Sequence[int | None]) -> dict[str, Any]:
-    """Compute the figures of kidnappings from the frames until each was found."""
-    return {
-        "kidnapped": len(found),
-        "found_within_40_frames": _share([n is not None and n <= FOUND_FRAMES for n in found]),
-        "frames_until_found": list(found),
     }
 
 

@@ -15,14 +15,12 @@ import ast
 import difflib
 import json
 import re
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
 
-from shared.descriptors.cached_weights import find_missing_weights
 from shared.errors import InvalidRequest, Misconfigured, NotFound, PlacewiseError
 
 
@@ -293,22 +291,6 @@ def suggest_name(name: str, known: Iterable[str]) -> str:
     if matches:
         return f" Did you mean {by_lower[matches[0]]}?"
     return f" Known: {', '.join(names)}."
-
-
-GPU_DEVICE_FILES = ("nvidia*", "nvhost*", "kfd", "dxg")  # in /dev: NVIDIA's, AMD's and WSL's
-
-
-def find_early_obstacles(arguments: TrainingArguments) -> list[PlacewiseError]:
-    """Return what keeps a run from starting, as far as this shows before PyTorch is imported."""
-    obstacles: list[PlacewiseError] = []
-    if arguments.accelerator in ("gpu", "cuda") and sys.platform == "linux":
-        if not any(any(Path("/dev").glob(name)) for name in GPU_DEVICE_FILES):
-            obstacles.append(no_gpu_error("This machine has no driver of a GPU"))
-    needs_data_root = arguments.experiment_phase != "test" or not arguments.eval_roots
-    if arguments.data_root is None and needs_data_root:
-        obstacles.append(data_root_error())
-    missing = find_missing_weights(arguments.backbone_arch, arguments.pretrained, arguments.weights)
-    return [*obstacles, *missing] if obstacles else []
 
 
 def combine_obstacles(obstacles: Sequence[PlacewiseError]) -> PlacewiseError:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, get_args
+from typing import get_args
 
 from pydantic import SecretStr, ValidationError
 from pydantic.fields import FieldInfo
@@ -89,17 +88,6 @@ def require_packages(*names: str) -> None:
             f"This command requires {', '.join(missing)}. "
             "Run `make setup`, or in the repository: uv pip install '.[lab]'.",
         )
-
-
-def import_lab(module: str, what: str) -> Any:
-    """Import a module of the lab for what it is needed for.
-
-    Raises:
-        Misconfigured: `lab_missing` where the lab is not installed.
-    """
-    if find_spec("lab") is None:
-        raise lab_missing(what)
-    return import_module(module)
 
 
 def lab_missing(what: str) -> Misconfigured:

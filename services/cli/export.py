@@ -38,7 +38,6 @@ from services.cli.output import (
 from shared.errors import Conflict, InvalidRequest
 
 EXPORTED_FILES = ("photos.csv", "names.txt", "descriptors.npy")
-FEATURES_FILE = "local.features"
 PHOTO_PROPERTIES = {
     "original_filename",
     "relative_path",
@@ -76,9 +75,6 @@ def descriptors(
         UUID | None,
         typer.Option(metavar="ID", help="Generation to export. Default: the active one."),
     ] = None,
-    features: Annotated[
-        bool, typer.Option("--features", help="Also export local features: local.features.")
-    ] = False,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
@@ -91,9 +87,9 @@ def descriptors(
     """
     with connect(server, map_name, key) as client, progress_bar() as progress:
         generation = generation or _active_generation_id(client)
-        receive = partial(client.export_descriptors, generation, features=features)
+        receive = partial(client.export_descriptors, generation)
         with _received_tar(out, receive, progress) as tar:
-            for name in (*EXPORTED_FILES, *([FEATURES_FILE] if features else [])):
+            for name in EXPORTED_FILES:
                 member = tar.extractfile(name)
                 assert member is not None, "the archive contains regular files"
                 with member, atomic_write(out / name) as file:

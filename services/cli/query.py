@@ -10,8 +10,7 @@ from rich.markup import escape
 from rich.progress_bar import ProgressBar
 from rich.table import Column
 
-from placewise.answers import CameraPose, Estimate, Matches, Similar
-from placewise.client import Client
+from placewise.answers import CameraPose, Estimate, Matches
 from services.cli.client import connect, describe_target
 from services.cli.output import (
     JsonOption,
@@ -19,16 +18,11 @@ from services.cli.output import (
     MapOption,
     ServerOption,
     Table,
-    atomic_write,
-    check_output_path,
     format_percent,
     print_json,
     print_message,
-    print_note,
     print_table,
-    printable_path,
 )
-from shared.errors import PlacewiseError
 from shared.search_api.protocol import MAX_MATCHED_PHOTOS
 
 BAR_WIDTH = 20  # characters
@@ -79,14 +73,6 @@ def query(
             metavar="N",
         ),
     ] = None,
-    explain: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.png",
-            help="Draw PHOTO beside each result that was matched, with lines between the matching "
-            "points.",
-        ),
-    ] = None,
     pose: Annotated[
         bool,
         typer.Option("--pose", help="Compute where the camera stood and looked, and how exactly."),
@@ -128,8 +114,6 @@ def query(
     as_json: JsonOption = False,
 ) -> None:
     """Find the indexed photos most similar to PHOTO. The query photo is not stored."""
-    if explain:
-        check_output_path(explain, ".png", "a drawing of matches")
     with connect(server, map_name, key) as client:
         answer = client.similar(
             photo,
@@ -137,7 +121,6 @@ def query(
             min_score=min_score,
             matches=matches,
             rerank=rerank,
-            explain=explain is not None,
             pose=pose,
             focal_length=focal_length,
             near=near,
@@ -152,8 +135,6 @@ def query(
             guarantee=guarantee,
         )
         target = describe_target(client, server, map_name)
-        if explain:
-            _draw_matches(client, photo, answer, explain)
     if as_json:
         print_json(answer)
         return
@@ -194,45 +175,6 @@ def query(
         f"vocabulary: {answer.vocabulary}\n"
         f"Searched {target}"
     )
-
-
-def _draw_matches(client: Client, photo: Path, answer: Similar, out: Path) -> None:
-    """Draw the query beside each photo that was matched, best first, below each other.
-
-    Raises:
-        Unprocessable: `photo_not_drawable`.
-    """
-    from services.cli import (
-        match_drawing,  # imports NumPy, which the command needs for nothing else
-    )
-
-    matches = answer.matches
-    if not matches or not matches.compared or not matches.query_width or not matches.query_height:
-        print_note(f"{printable_path(out)} was not drawn: no photo was matched.")
-        return
-    query_size = (matches.query_width, matches.query_height)
-    query = match_drawing.read_photo(photo.read_bytes(), printable_path(photo))
-    drawings = []
-    for rank, match in enumerate(answer.similar_images, start=1):
-        if match.pairs is None:
-            continue
-        name = match.relative_path or match.original_filename
-        try:
-            original = client.image(match.image_id)
-        except PlacewiseError as error:
-            raise match_drawing.photo_not_drawable_error(name, error) from error
-        drawings.append(
-            match_drawing.draw_matches(
-                query,
-                match_drawing.read_photo(original, name),
-                match.pairs,
-                query_size,
-                (match.width, match.height),
-                f"{rank}. {name}: {len(match.pairs)} matching points",
-            )
-        )
-    with atomic_write(out) as file:
-        match_drawing.stack(drawings).save(file, "PNG")
 
 
 def _pose_table(pose: CameraPose) -> Table:

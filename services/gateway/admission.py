@@ -17,10 +17,9 @@ import contextlib
 import math
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from enum import StrEnum
-from functools import partial
 from typing import Annotated, NoReturn
 from uuid import UUID
 
@@ -163,10 +162,6 @@ class AdmissionControl:
             _check_queue(f"jobs of the map {map_name!r}", of_map, _half(limit), depth)
             self._admitted[map_name] += 1
 
-    def may_block(self) -> bool:
-        """Return whether admitting queries the catalog or a local disk now."""
-        return self.disk.is_used or self._queue_depth.is_due()
-
     def check_queue(self) -> None:
         """Check that the queue has room for jobs of some map.
 
@@ -238,26 +233,19 @@ AdmissionDep = Annotated[AdmissionControl, Depends(_get_admission_control)]
 # dependency for every request, which takes as long as admitting it.
 
 
-async def _admit_job(request: Request) -> None:
+def _admit_job(request: Request) -> None:
     admission: AdmissionControl = request.app.state.admission
-    await _run(admission, partial(admission.admit_job, get_map_name(request)))
+    admission.admit_job(get_map_name(request))
 
 
-async def _admit_query(request: Request) -> None:
+def _admit_query(request: Request) -> None:
     admission: AdmissionControl = request.app.state.admission
-    await _run(admission, admission.admit_query)
+    admission.admit_query()
 
 
-async def _check_disk(request: Request) -> None:
+def _check_disk(request: Request) -> None:
     admission: AdmissionControl = request.app.state.admission
-    await _run(admission, admission.disk.check)
-
-
-async def _run(admission: AdmissionControl, admit: Callable[[], None]) -> None:
-    if admission.may_block():
-        await run_in_threadpool(admit)
-    else:
-        admit()
+    admission.disk.check()
 
 
 async def _check_photo_quota(request: Request) -> None:

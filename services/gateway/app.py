@@ -106,7 +106,6 @@ def create_app(gateway: GatewayContext) -> FastAPI:
     )
     app.state.gateway = gateway
     app.state.admission = AdmissionControl(gateway.catalog, gateway.settings)
-    app.state.rate_limiter = RateLimiter(gateway.settings)
     app.state.photo_quota = PhotoQuota(gateway.catalog)
     gateway_metrics = GatewayMetrics(gateway, app.state.admission)
     # Starlette runs the middleware that is added last first.
@@ -121,7 +120,7 @@ def create_app(gateway: GatewayContext) -> FastAPI:
             f"{API_PREFIX}{similarity.GEOPOSE_PATH}": MAX_GEOPOSE_BYTES,
         },
     )
-    app.add_middleware(RateLimitMiddleware, limiter=app.state.rate_limiter)
+    app.add_middleware(RateLimitMiddleware, limiter=RateLimiter(gateway.settings))
     app.add_middleware(AuthenticationMiddleware, authenticator=gateway.authenticator)
     app.add_middleware(ExceptionHandlerMiddleware)
     if gateway.settings.allowed_origins:

@@ -13,13 +13,13 @@ from __future__ import annotations
 import hmac
 import logging
 import re
-from collections.abc import Container, Iterable
+from collections.abc import Container
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from typing import Annotated, Protocol
 from urllib.parse import urlsplit
 from uuid import UUID
 
-from cachetools import TTLCache
 from fastapi import APIRouter, Request, Security
 from fastapi.params import Security as SecurityParameter
 from fastapi.routing import APIRoute
@@ -30,12 +30,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from services.http_server import PEER_ADDRESS
-from shared.catalog.api_keys import (
-    LAST_USED_RESOLUTION_SECONDS,
-    KeyLimits,
-    authenticate_api_key,
-    record_key_use,
-)
+from shared.catalog.api_keys import ApiKey, KeyLimits, authenticate_api_key, record_key_use
 from shared.catalog.database.errors import to_unavailable
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import DEFAULT_MAP
@@ -53,7 +48,7 @@ HOW_TO_AUTHENTICATE = (
 )
 # Headers that proxies add (RFC 9110, RFC 7239, and the de facto ones before them).
 FORWARDED = ("Forwarded", "Via", "X-Forwarded-For", "X-Forwarded-Host", "X-Real-IP")
-MAX_REMEMBERED_USES = 10_000  # keys whose last use was recorded lately
+USE_RESOLUTION = timedelta(minutes=1)  # of `last_used_at` of a key
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,9 +99,6 @@ class Authenticator(Protocol):
             Unavailable: The catalog can't be reached.
         """
 
-    async def record_use(self, caller: Caller) -> None:
-        """Called after the response has been sent."""
-
 
 class LocalhostAuthenticator:
     """Accepts requests of this machine without a key.
@@ -141,9 +133,6 @@ class LocalhostAuthenticator:
         check_same_origin(headers, self._trusted)
         return Caller("this machine", ALL_SCOPES)
 
-    async def record_use(self, caller: Caller) -> None:
-        pass
-
 
 def check_same_origin(headers: Headers, trusted_origins: Container[str]) -> None:
     """Raise Forbidden (`foreign_page`) if a web page of another origin sends the request."""
@@ -176,9 +165,6 @@ class ApiKeyAuthenticator:
         """`admin_sha256` are hexadecimal hashes of admin keys (`hash_api_key`)."""
         self._catalog = catalog
         self._admins = admin_sha256
-        self._recently_recorded: TTLCache[UUID, bool] = TTLCache(
-            MAX_REMEMBERED_USES, LAST_USED_RESOLUTION_SECONDS
-        )
 
     async def authenticate(self, headers: Headers, peer: str | None = None) -> Caller:
         key_sha256 = hash_api_key(parse_bearer(headers.get("authorization")))
@@ -200,30 +186,24 @@ class ApiKeyAuthenticator:
             if unavailable is None:
                 raise
             raise unavailable from error
+        self._record_use(key)
         return Caller(
             identity=f"key {key.id}",
             scopes=expand_scopes([KeyScope(scope) for scope in key.scopes]),
             key_id=key.id,
-            limits=KeyLimits(key.requests_per_minute, key.upload_bytes_per_day, key.max_photos),
+            limits=KeyLimits(key.requests_per_minute, key.max_photos),
             maps=None if key.maps is None else frozenset(key.maps),
         )
 
-    async def record_use(self, caller: Caller) -> None:
-        """Update `last_used_at` at most once a minute per key; errors are only logged."""
-        key_id = caller.key_id
-        if key_id is None or key_id in self._recently_recorded:
+    def _record_use(self, key: ApiKey) -> None:
+        """Update `last_used_at` at most once a minute; errors are only logged."""
+        if key.last_used_at is not None and datetime.now(UTC) - key.last_used_at < USE_RESOLUTION:
             return
-        self._recently_recorded[key_id] = True
         try:
-            await run_in_threadpool(self._write_use, key_id)
+            with self._catalog.write() as session:
+                record_key_use(session, key.id)
         except SQLAlchemyError as error:
-            log.warning(
-                "the use of the key %s was not recorded: %s", key_id, error.__class__.__name__
-            )
-
-    def _write_use(self, key_id: UUID) -> None:
-        with self._catalog.write() as session:
-            record_key_use(session, key_id)
+            log.warning("the use of the key %s was not recorded: %s", key.id, type(error).__name__)
 
 
 def parse_bearer(authorization: str | None) -> str:
@@ -277,10 +257,7 @@ class AuthenticationMiddleware:
             await problem_response(error, request)(scope, receive, send)
             return
         request.state.caller = caller
-        try:
-            await self._app(scope, receive, send)
-        finally:
-            await self._authenticator.record_use(caller)
+        await self._app(scope, receive, send)
 
 
 def _is_public(path: str) -> bool:
@@ -298,13 +275,9 @@ async def _require_scope(
     scopes: SecurityScopes,
     _documented_scheme: Annotated[object, Security(BEARER_SCHEME)],
 ) -> None:
-    check_scopes(request, scopes.scopes)
-
-
-def check_scopes(request: Request, scopes: Iterable[str]) -> None:
     """Raise Forbidden if the caller lacks a scope, or may not use the request's map."""
     caller = get_caller(request)
-    missing = set(scopes) - caller.scopes
+    missing = set(scopes.scopes) - caller.scopes
     if missing:
         raise Forbidden(
             "scope_missing",

@@ -37,7 +37,7 @@ from shared.storage import OwnedStore
 
 MAX_WAIT_SECONDS = 60.0  # of `Prefer: wait` and `?wait=`
 NOTIFIER_POLL_SECONDS = 0.02  # poll interval while a request waits for the end of a job
-CHANGE_POLL_SECONDS = 0.25  # poll interval while a request waits for a change of a job
+CHANGE_POLL_SECONDS = 0.25  # poll interval while requests wait only for changes of jobs
 POLL_COST_DIVISOR = 2  # at most a third of the time is spent polling: slow polls become rare
 MAX_POLL_PAUSE_SECONDS = 1.0  # after a slow poll: the jobs of waiting requests may have ended
 # Requests may wait this long after the shutdown has begun. Most queries end within this time.
@@ -59,20 +59,12 @@ WatchedState = tuple[Any, ...]
 """The values of WATCHED_COLUMNS; () for a job that the caller has not seen yet."""
 
 
-@dataclass(frozen=True, slots=True)
-class Change:
-    """A job after a change, and the state to pass to the next `wait_for_change`."""
-
-    job: Job
-    state: WatchedState
-
-
 @dataclass(eq=False, slots=True)
 class _Waiter:
     job_id: UUID
     last_seen: WatchedState | None
     """The state that the request knows; None if it waits for the end of the job."""
-    future: asyncio.Future[Change | None]
+    future: asyncio.Future[WatchedState | None]
 
 
 class JobNotifier:
@@ -88,7 +80,6 @@ class JobNotifier:
         self._shutdown_wait_seconds = shutdown_wait_seconds
         self._waiters: set[_Waiter] = set()
         self._poll_task: asyncio.Task[None] | None = None
-        self._next_change_poll = 0.0
         self._shutdown_deadline = math.inf
 
     def begin_shutdown(self) -> None:
@@ -114,11 +105,11 @@ class JobNotifier:
 
     async def wait_for_change(
         self, job_id: UUID, last_seen: WatchedState, seconds: float
-    ) -> Change | None:
+    ) -> WatchedState | None:
         """Wait until the state of the job differs from `last_seen`.
 
         Returns:
-            The changed job; None if it was deleted or the server is stopping.
+            The new state; None if the job was deleted or the server is stopping.
 
         Raises:
             TimeoutError: The job has not changed within `seconds`.
@@ -130,7 +121,7 @@ class JobNotifier:
 
     async def _wait(
         self, job_id: UUID, last_seen: WatchedState | None, seconds: float
-    ) -> Change | None:
+    ) -> WatchedState | None:
         waiter = _Waiter(job_id, last_seen, asyncio.get_running_loop().create_future())
         self._waiters.add(waiter)
         if self._poll_task is None:
@@ -156,28 +147,21 @@ class JobNotifier:
 
     async def _poll(self, now: float) -> None:
         """Wake the waiters whose jobs have ended or changed."""
-        due = set(self._waiters)
-        if now >= self._next_change_poll:
-            self._next_change_poll = now + CHANGE_POLL_SECONDS
-        else:
-            due = {waiter for waiter in due if waiter.last_seen is None}
-        if not due:
+        waiters = set(self._waiters)
+        if not waiters:
             return
         try:
-            job_ids = {waiter.job_id for waiter in due}
+            job_ids = {waiter.job_id for waiter in waiters}
             states = await run_in_threadpool(_load_watched_states, self._catalog, job_ids)
-            ready = {waiter for waiter in due if _is_ready(waiter, states.get(waiter.job_id))}
-            changed = {waiter.job_id for waiter in ready if waiter.last_seen is not None}
-            jobs = await run_in_threadpool(_load_jobs, self._catalog, changed) if changed else {}
         except Exception as error:  # raised by the waiting requests
-            for waiter in due:
+            for waiter in waiters:
                 if not waiter.future.done():
                     waiter.future.set_exception(error)
             return
-        for waiter in ready:
-            if not waiter.future.done():
-                job = jobs.get(waiter.job_id)
-                waiter.future.set_result(None if job is None else Change(job, states[job.id]))
+        for waiter in waiters:
+            state = states.get(waiter.job_id)
+            if _is_ready(waiter, state) and not waiter.future.done():
+                waiter.future.set_result(state)
         if now >= self._shutdown_deadline:
             _release(self._waiters)
 
@@ -201,12 +185,6 @@ def _load_watched_states(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, Wat
     with catalog.read() as session:
         rows = session.execute(select(Job.id, *WATCHED_COLUMNS).where(Job.id.in_(job_ids)))
         return {row[0]: tuple(row[1:]) for row in rows}
-
-
-def _load_jobs(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, Job]:
-    with catalog.read() as session:
-        jobs = session.scalars(select(Job).where(Job.id.in_(job_ids)))
-        return {job.id: job for job in jobs}
 
 
 API_PREFIX = "/api/v1"
@@ -364,12 +342,13 @@ def load_job_of_map(gateway: GatewayContext, map_name: str, job_id: UUID) -> Job
         return get_job(session, get_map(session, map_name).id, job_id)
 
 
+def find_job(gateway: GatewayContext, job_id: UUID) -> Job | None:
+    """Load a job; None if it was deleted."""
+    with gateway.catalog.read() as session:
+        return session.get(Job, job_id)
+
+
 async def wait_for_job(gateway: GatewayContext, job_id: UUID, seconds: float) -> Job | None:
     """Wait at most `seconds` for the end of the job; return None if the job was deleted."""
-
-    def load() -> Job | None:
-        with gateway.catalog.read() as session:
-            return session.get(Job, job_id)
-
     await gateway.job_notifier.wait_until_finished(job_id, seconds)
-    return await run_in_threadpool(load)
+    return await run_in_threadpool(find_job, gateway, job_id)

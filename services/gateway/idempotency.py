@@ -11,11 +11,9 @@ dependency, and by storing its response in the transaction that executes the req
 and `idempotent.accept_job(session, job)` stores and returns the 202 of a job.
 
 The content of a multipart form is known only after it has been received: its routes use
-`IdempotentFormDep`, and execute the request in `with idempotent.claim_form(upload):`.
+`IdempotentFormDep`, and execute the request in `with idempotent.begin_form(upload):`.
 
-Stored are responses of executed requests, and 4xx responses that a repetition would get again;
-never a 5xx, nor responses that depend on the caller and the time (401, 403, 408, 429). A request
-without the header costs nothing.
+Refusals are not stored: a repeated request is checked again.
 """
 
 from __future__ import annotations
@@ -26,7 +24,6 @@ import json
 import re
 from collections.abc import AsyncIterator, Iterator
 from typing import Annotated, Any
-from uuid import UUID
 
 from fastapi import Depends, Header, Request, Response
 from pydantic import BaseModel
@@ -36,15 +33,9 @@ from starlette.concurrency import run_in_threadpool
 from services.gateway.authentication import get_caller
 from services.gateway.dependencies import GatewayContext, GatewayDep, get_map_name
 from services.gateway.responses import JobAcceptedResponse
-from shared.catalog.idempotency import (
-    RequestIdentity,
-    StoredResponse,
-    claim_idempotency_key,
-    release_idempotency_key,
-    store_response,
-)
-from shared.errors import Conflict, PlacewiseError, invalid_field_error
-from shared.http.problem_details import problem_response
+from shared.catalog.database.base import db_now_plus
+from shared.catalog.idempotency import StoredResponse, find_response, store_response
+from shared.errors import PlacewiseError, invalid_field_error
 from shared.ingest.validation import StoredUpload
 from shared.jobs import Job
 from shared.storage import ObjectStore
@@ -53,8 +44,6 @@ IDEMPOTENCY_HEADER = "Idempotency-Key"
 REPLAYED_HEADER = "Idempotent-Replayed"
 IDEMPOTENCY_KEY_PATTERN = r"[!-~]{1,255}"
 KEY_SECONDS = 86_400.0  # for which a key is remembered
-LEASE_SECONDS = 30.0  # longer than it takes to execute a received request and commit
-UNSTORED_STATUSES = (401, 403, 408, 429)
 
 IdempotencyKeyHeader = Annotated[
     str | None,
@@ -70,25 +59,20 @@ IdempotencyKeyHeader = Annotated[
 class IdempotentReplay(Exception):
     """Raised for a request that was already executed; carries its stored response."""
 
-    def __init__(self, stored_response: StoredResponse) -> None:
-        super().__init__(stored_response.status)
-        self.stored_response = stored_response
+    def __init__(self, status: int, headers: dict[str, str], body: str) -> None:
+        super().__init__(status)
+        self.status, self.headers, self.body = status, headers, body
 
 
 async def replay_response(request: Request, replay: Exception) -> Response:
     """Exception handler of `IdempotentReplay`."""
     assert isinstance(replay, IdempotentReplay)
-    stored = replay.stored_response
-    return Response(
-        stored.body,
-        stored.status,
-        {**stored.headers, REPLAYED_HEADER: "true"},
-        media_type="application/problem+json" if stored.status >= 400 else "application/json",
-    )
+    headers = {**replay.headers, REPLAYED_HEADER: "true"}
+    return Response(replay.body, replay.status, headers, media_type="application/json")
 
 
 class IdempotentRequest:
-    """A request with an `Idempotency-Key`; without the header, nothing is claimed or stored."""
+    """A request with an `Idempotency-Key`; without the header, nothing is looked up or stored."""
 
     def __init__(
         self, gateway: GatewayContext, request: Request, response: Response, key: str | None
@@ -101,65 +85,75 @@ class IdempotentRequest:
         self._request = request
         self._response = response
         self.key = key
-        self._token: UUID | None = None
-        self._response_stored = False
+        self._fingerprint: str | None = None
+        """Of the request, once its content is known; None without a key."""
+        self._life_seconds = KEY_SECONDS
 
     @contextlib.contextmanager
-    def claim_form(self, upload: StoredUpload, life_seconds: float | None = None) -> Iterator[None]:
-        """Claim the key for the content of a form; the block executes the request.
+    def begin_form(self, upload: StoredUpload, life_seconds: float = KEY_SECONDS) -> Iterator[None]:
+        """As `begin`, with the content of a form; the block executes the request.
 
         Deletes the received file if the request is refused or was already executed.
         """
         with delete_if_refused(self._gateway.store, upload.key):
-            self.claim_key([upload.filename, upload.sha256, upload.fields], life_seconds)
+            self.begin([upload.filename, upload.sha256, upload.fields], life_seconds)
             yield
 
-    def claim_key(self, content: Any, life_seconds: float | None = None) -> None:
-        """Claim the key: from here on only this request is executed under it.
+    def begin(self, content: Any, life_seconds: float = KEY_SECONDS) -> None:
+        """Begin to execute the request, unless that was done before.
 
         Args:
             content: The content of the request, serializable as JSON.
-            life_seconds: How long the response is stored, at most; None for the setting.
+            life_seconds: How long its response is stored.
 
         Raises:
             IdempotentReplay: The request was already executed.
-            PlacewiseError: Those of `claim_idempotency_key`.
+            Unprocessable: `idempotency_key_reused`.
         """
         if self.key is None:
             return
         request = self._request
         params = [item for item in request.query_params.multi_items() if item[0] != "map"]
-        fingerprinted = [request.url.path, sorted(params), content]
-        identity = RequestIdentity(
-            scope=_key_scope(request),
-            key=self.key,
-            call=f"{request.method} {request.scope['route'].path_format}",
-            fingerprint=hashlib.sha256(
-                json.dumps(fingerprinted, sort_keys=True).encode()
-            ).hexdigest(),
-        )
-        with self._gateway.catalog.write() as session:
-            claimed = claim_idempotency_key(
-                session,
-                identity,
-                lease_seconds=LEASE_SECONDS,
-                life_seconds=min(KEY_SECONDS, life_seconds or KEY_SECONDS),
-            )
-        if isinstance(claimed, StoredResponse):
-            raise IdempotentReplay(claimed)
-        self._token = claimed
+        call = [request.method, request.url.path, sorted(params), content]
+        self._fingerprint = hashlib.sha256(json.dumps(call, sort_keys=True).encode()).hexdigest()
+        self._life_seconds = life_seconds
+        self.replay_if_executed()
+
+    def replay_if_executed(self) -> None:
+        """Raise as `begin` does, if another process has executed the request meanwhile."""
+        if self._fingerprint is None:
+            return
+        with self._gateway.catalog.read() as session:
+            if (stored := self._find_response(session)) is not None:
+                raise IdempotentReplay(stored.status, stored.headers, stored.body)
+
+    def _find_response(self, session: Session) -> StoredResponse | None:
+        if self.key is None or self._fingerprint is None:
+            return None
+        return find_response(session, _key_scope(self._request), self.key, self._fingerprint)
 
     def store_response(
         self, session: Session, status: int, body: BaseModel, headers: dict[str, str] | None = None
     ) -> None:
         """Store the response, in the transaction that executes the request.
 
-        A response that was stored before is replaced.
+        Raises:
+            IdempotentReplay: Another process was faster; the transaction is rolled back.
         """
-        if self._token is not None:
-            stored = StoredResponse(status, headers or {}, body.model_dump_json())
-            store_response(session, self._token, stored)
-            self._response_stored = True
+        if self.key is None or self._fingerprint is None:
+            return
+        new = StoredResponse(
+            scope=_key_scope(self._request),
+            key=self.key,
+            fingerprint=self._fingerprint,
+            status=status,
+            headers=headers or {},
+            body=body.model_dump_json(),
+            expires_at=db_now_plus(self._life_seconds),
+        )
+        stored = store_response(session, new)
+        if stored is not new:
+            raise IdempotentReplay(stored.status, stored.headers, stored.body)
 
     def store_job_response(self, session: Session, job: Job) -> JobAcceptedResponse:
         """Add a job to the transaction, and store and return its 202 response."""
@@ -179,31 +173,12 @@ class IdempotentRequest:
         self, status: int, body: BaseModel, headers: dict[str, str] | None = None
     ) -> None:
         """Replace the stored response in a transaction of its own."""
-        if self._token is not None:
-            with self._gateway.catalog.write() as session:
-                self.store_response(session, status, body, headers)
-
-    def store_refusal(self, error: PlacewiseError) -> None:
-        """Store the refusal of a request, unless a repetition might succeed."""
-        if (
-            self._token is None
-            or self._response_stored
-            or error.status >= 500
-            or error.status in UNSTORED_STATUSES
-        ):
+        if self._fingerprint is None:
             return
-        response = problem_response(error, self._request)
-        stored = StoredResponse(error.status, {}, bytes(response.body).decode())
-        # Conflict: a repetition took over the expired lease, and its response counts.
-        with contextlib.suppress(Conflict), self._gateway.catalog.write() as session:
-            store_response(session, self._token, stored)
-            self._response_stored = True
-
-    def release_key(self) -> None:
-        """Release the key if no response was stored under it."""
-        if self._token is not None and not self._response_stored:
-            with self._gateway.catalog.write() as session:
-                release_idempotency_key(session, self._token)
+        with self._gateway.catalog.write() as session:
+            if (stored := self._find_response(session)) is not None:
+                stored.status, stored.headers = status, headers or {}
+                stored.body = body.model_dump_json()
 
 
 @contextlib.contextmanager
@@ -222,26 +197,23 @@ def delete_if_refused(store: ObjectStore, key: str) -> Iterator[None]:
 async def _idempotent_form_request(
     request: Request, response: Response, gateway: GatewayDep, key: IdempotencyKeyHeader = None
 ) -> AsyncIterator[IdempotentRequest]:
-    """Dependency for streamed bodies: the route calls `claim_form` or `claim_key` itself."""
+    """Dependency for streamed bodies: the route calls `begin_form` or `begin` itself."""
     idempotent = IdempotentRequest(gateway, request, response, key)
     try:
         yield idempotent
-    except PlacewiseError as error:
-        if key is not None:
-            await run_in_threadpool(idempotent.store_refusal, error)
+    except PlacewiseError:
+        # The reason may be that another process has executed the same request meanwhile.
+        await run_in_threadpool(idempotent.replay_if_executed)
         raise
-    finally:
-        if key is not None:
-            await run_in_threadpool(idempotent.release_key)
 
 
 async def _idempotent_request(
     request: Request, idempotent: Annotated[IdempotentRequest, Depends(_idempotent_form_request)]
 ) -> IdempotentRequest:
-    """Dependency for requests with a JSON body or none; claims the key."""
+    """Dependency for requests with a JSON body or none."""
     if idempotent.key is not None:
         content = hashlib.sha256(await request.body()).hexdigest()
-        await run_in_threadpool(idempotent.claim_key, content)
+        await run_in_threadpool(idempotent.begin, content)
     return idempotent
 
 

@@ -7,13 +7,16 @@ plan does not depend on the estimates of the planner.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from datetime import datetime
+from typing import Literal
 from uuid import UUID
 
+from pydantic import Field
 from sqlalchemy import Select, Uuid, func, literal, or_, select, tuple_
 from sqlalchemy.orm import Session, aliased
 
+from services.gateway.dependencies import NO_NUL_PATTERN, PageParams
+from services.gateway.similarity.search_params import FilterParams
 from shared.catalog.chunks import select_failed_photos
 from shared.catalog.database.base import (
     Condition,
@@ -25,41 +28,50 @@ from shared.catalog.database.base import (
     json_array_has_part,
 )
 from shared.catalog.photos import Photo, PhotoRole, has_given_place, is_geotagged, is_removed
+from shared.ingest.photo_metadata import parse_time
 from shared.place_paths import PATH_SEPARATOR
-from shared.search_api.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
+from shared.search_api.photo_filter import Box, Circle, PhotoFilter
 
 # Upper limit of the total: the cost of a count grows with the number of matches.
 MAX_COUNTED_MATCHES = 10_000
 TRIGRAM_CHARACTERS = 3
 
 
-@dataclass(frozen=True, slots=True)
-class MetadataFilter:
-    """Conditions of a metadata search; None means "any". Bounds are inclusive."""
+class MetadataSearchParams(FilterParams, PageParams):
+    """Query parameters of a metadata search; bounds are inclusive."""
 
-    filename: str | None = None
-    """Substring of the file name or the relative path, case-insensitive; `%` and `_` are ordinary
-    characters."""
-    upload_after: datetime | None = None
-    upload_before: datetime | None = None
-    min_file_size: int | None = None
-    max_file_size: int | None = None
-    photos: PhotoFilter = NO_FILTER
-    """Filter by location, time, place and tags."""
-    role: PhotoRole | None = None
-    failed: bool = False
-    """Whether the photo's description has to have failed."""
-    without_place: bool = False
-    """Whether the photo must have neither coordinates nor a label."""
-    place_given: bool = False
-    """Whether the photo's place must have been given here."""
-    removed: bool = False
-    """Whether the photo must be in the trash, instead of live."""
-    by_capture: bool = False
-    """Whether photos are sorted by when they were taken, and have to be dated."""
+    filename: str | None = Field(
+        None,
+        max_length=1000,
+        pattern=NO_NUL_PATTERN,
+        description="part of the file name or of `relative_path`, case-insensitive",
+    )
+    upload_after: str | None = Field(None, description="ISO 8601; no offset means UTC")
+    upload_before: str | None = Field(None, description="ISO 8601; no offset means UTC")
+    min_file_size: int | None = Field(None, ge=0, le=2**62)
+    max_file_size: int | None = Field(None, ge=0, le=2**62)
+    role: PhotoRole | None = Field(None, description="photos with this role; omitted: all")
+    failed: bool = Field(
+        False, description="photos that can't be searched for, because their description failed"
+    )
+    without_place: bool = Field(
+        False, description="photos that have neither coordinates nor a place label"
+    )
+    place_given: bool = Field(
+        False, description="photos whose place was given with `POST /places`, and not undone"
+    )
+    removed: bool = Field(False, description="photos in the trash, instead of those of the map")
+    sort: Literal["added", "taken"] = Field(
+        "added", description="newest first; `taken`: only photos whose time is known"
+    )
+    limit: int = Field(100, ge=1, le=1000)
 
     def conditions(self, photo: type[Photo] = Photo, *, trigrams: bool) -> list[Condition]:
-        """Return the SQL conditions; `trigrams` if the catalog has a trigram index (PostgreSQL)."""
+        """Return the SQL conditions; 422 (`invalid_field`) names the invalid parameter.
+
+        Args:
+            trigrams: Whether the catalog has a trigram index (PostgreSQL).
+        """
         conditions: list[Condition] = []
         if self.filename is not None:
             names = (photo.filename, photo.relative_path)
@@ -69,10 +81,10 @@ class MetadataFilter:
             if trigrams and len(self.filename) >= TRIGRAM_CHARACTERS:
                 part = filename_trigrams(literal(self.filename))
                 conditions.append(or_(*(filename_trigrams(n).bool_op("@>")(part) for n in names)))
-        if self.upload_after is not None:
-            conditions.append(photo.uploaded_at >= self.upload_after)
-        if self.upload_before is not None:
-            conditions.append(photo.uploaded_at <= self.upload_before)
+        if self.upload_after:
+            conditions.append(photo.uploaded_at >= parse_time("upload_after", self.upload_after))
+        if self.upload_before:
+            conditions.append(photo.uploaded_at <= parse_time("upload_before", self.upload_before))
         if self.min_file_size is not None:
             conditions.append(photo.size_bytes >= self.min_file_size)
         if self.max_file_size is not None:
@@ -83,7 +95,7 @@ class MetadataFilter:
             conditions.append(~is_geotagged(photo))
         if self.place_given:
             conditions.append(has_given_place(photo))
-        return conditions + filter_conditions(self.photos, photo)
+        return conditions + filter_conditions(self.photo_filter(), photo)
 
 
 def filter_conditions(photo_filter: PhotoFilter, photo: type[Photo] = Photo) -> list[Condition]:
@@ -118,7 +130,7 @@ def filter_conditions(photo_filter: PhotoFilter, photo: type[Photo] = Photo) -> 
 def search_photos(
     session: Session,
     map_id: UUID,
-    metadata_filter: MetadataFilter,
+    query: MetadataSearchParams,
     limit: int,
     after: tuple[datetime, UUID] | None,
 ) -> tuple[list[Photo], int]:
@@ -131,15 +143,15 @@ def search_photos(
         A page of photos, and the total number of matches, counted up to MAX_COUNTED_MATCHES.
     """
     on_postgres = session.get_bind().dialect.name == "postgresql"
-    is_there = is_removed() if metadata_filter.removed else Photo.deleted_at.is_(None)
+    is_there = is_removed() if query.removed else Photo.deleted_at.is_(None)
     live = [Photo.map_id == map_id, is_there]
-    if metadata_filter.failed:
+    if query.failed:
         live.append(Photo.id.in_(select_failed_photos(map_id)))
-    if metadata_filter.by_capture:
+    if query.sort == "taken":
         live.append(Photo.captured_at.is_not(None))
-    conditions = [*live, *metadata_filter.conditions(trigrams=on_postgres)]
+    conditions = [*live, *query.conditions(trigrams=on_postgres)]
     total = count_rows(session, select(Photo.id).where(*conditions), MAX_COUNTED_MATCHES)
-    time = Photo.captured_at if metadata_filter.by_capture else Photo.uploaded_at
+    time = Photo.captured_at if query.sort == "taken" else Photo.uploaded_at
     newest = (time.desc(), Photo.id.desc())
     if after is not None:
         live.append(tuple_(time, Photo.id) < tuple_(*_cursor_bound(after)))
@@ -155,7 +167,7 @@ def search_photos(
         # their indexes and sort hundreds of thousands of rows.
         newest_first = select(Photo).where(*live).order_by(*newest).offset(0).subquery()
         scanned = aliased(Photo, newest_first)
-        page = select(scanned).where(*metadata_filter.conditions(scanned, trigrams=False))
+        page = select(scanned).where(*query.conditions(scanned, trigrams=False))
         page = page.order_by(getattr(scanned, time.key).desc(), scanned.id.desc())
     return list(session.scalars(page.limit(limit))), total
 

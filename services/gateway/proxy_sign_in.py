@@ -68,9 +68,6 @@ class _ProxySignIn:
             scopes |= self.scopes_by_group.get(group, frozenset())
         return Caller(f"user {names[0].strip()}", expand_scopes(scopes))
 
-    async def record_use(self, caller: Caller) -> None:
-        await self.keys.record_use(caller)
-
 
 def with_proxy_sign_in(keys: Authenticator, settings: Settings) -> Authenticator:
     """Return an authenticator that also accepts users of SIGN_IN_PROXIES, if that is set."""

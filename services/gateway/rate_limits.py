@@ -1,4 +1,4 @@
-"""Rate limits and quotas of API keys: requests per minute and uploaded bytes per day.
+"""Rate limits of API keys: requests per minute.
 
 The counters are in Redis, shared by all gateways, or in memory in the embedded server. While Redis
 is unreachable, all requests are let through: the limits protect the service from overload and must
@@ -11,18 +11,18 @@ import logging
 import math
 import time
 
-from limits import RateLimitItem, RateLimitItemPerDay, RateLimitItemPerMinute
+from limits import RateLimitItemPerMinute
 from limits.errors import StorageError
 from limits.storage import MemoryStorage, RedisStorage
 from limits.strategies import SlidingWindowCounterRateLimiter
 from starlette.concurrency import run_in_threadpool
-from starlette.datastructures import Headers, MutableHeaders
+from starlette.datastructures import MutableHeaders
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from services.gateway.authentication import Caller
 from shared.config.settings import Settings
-from shared.errors import InvalidRequest, LengthRequired, PlacewiseError, TooManyRequests
+from shared.errors import PlacewiseError, TooManyRequests
 from shared.http.problem_details import problem_response
 
 log = logging.getLogger(__name__)
@@ -33,7 +33,7 @@ KEY_PREFIX = "placewise:limits"
 
 
 class RateLimiter:
-    """Counts requests and uploaded bytes per key.
+    """Counts requests per key.
 
     Thread-safe; blocks for REDIS_TIMEOUT_SECONDS at most.
     """
@@ -53,40 +53,11 @@ class RateLimiter:
             TooManyRequests: `too_many_requests`.
         """
         limit = caller.limits.requests_per_minute or self._settings.key_requests_per_minute
-        if caller.key_id is None or limit is None:
+        if caller.key_id is None or limit is None or time.monotonic() < self._redis_retry_at:
             return {}
-        message = f"This key is limited to {limit} requests per minute."
-        window = RateLimitItemPerMinute(limit)
-        return self._hit(caller, "requests", window, 1, "too_many_requests", message)
-
-    def count_upload_bytes(self, caller: Caller, size_bytes: int) -> None:
-        """Count bytes that are about to be sent against the daily quota.
-
-        Raises:
-            TooManyRequests: `upload_quota_reached`.
-        """
-        limit = self.daily_upload_bytes(caller)
-        if limit is None or not size_bytes:
-            return
-        message = f"This key is limited to {limit} bytes per day; this request has {size_bytes}."
-        window = RateLimitItemPerDay(limit)
-        self._hit(caller, "upload-bytes", window, size_bytes, "upload_quota_reached", message)
-
-    def daily_upload_bytes(self, caller: Caller) -> int | None:
-        """Return the daily quota of the caller in bytes; None if it is unlimited."""
-        if caller.key_id is None:
-            return None
-        return caller.limits.upload_bytes_per_day or self._settings.key_upload_bytes_per_day
-
-    def _hit(
-        self, caller: Caller, name: str, window: RateLimitItem, cost: int, code: str, message: str
-    ) -> dict[str, str]:
-        """Count in a window; return the RateLimit headers, or raise `code` beyond the limit."""
-        if time.monotonic() < self._redis_retry_at:
-            return {}
-        names = (name, str(caller.key_id))
+        window, names = RateLimitItemPerMinute(limit), ("requests", str(caller.key_id))
         try:
-            allowed = self._counter.hit(window, *names, cost=cost)
+            allowed = self._counter.hit(window, *names)
             reset_at, remaining = self._counter.get_window_stats(window, *names)
         except StorageError as error:
             if not self._redis_retry_at:
@@ -101,21 +72,21 @@ class RateLimiter:
         seconds = max(1, math.ceil(reset_at - time.time()))
         if not allowed:
             raise TooManyRequests(
-                code,
-                f"{message} Retry after the seconds in Retry-After, or ask an admin for a key with "
-                "a higher limit.",
+                "too_many_requests",
+                f"This key is limited to {limit} requests per minute. Retry after the seconds in "
+                "Retry-After, or ask an admin for a key with a higher limit.",
                 retry_after_seconds=seconds,
-                limit=window.amount,
+                limit=limit,
                 remaining=remaining,
             )
         return {  # draft-ietf-httpapi-ratelimit-headers-10
-            "RateLimit-Policy": f'"{name}";q={window.amount};w={window.get_expiry()}',
-            "RateLimit": f'"{name}";r={remaining};t={seconds}',
+            "RateLimit-Policy": f'"requests";q={limit};w={window.get_expiry()}',
+            "RateLimit": f'"requests";r={remaining};t={seconds}',
         }
 
 
 class RateLimitMiddleware:
-    """Applies the rate limits of the key and adds the RateLimit headers to the response."""
+    """Applies the rate limit of the key and adds the RateLimit headers to the response."""
 
     def __init__(self, app: ASGIApp, limiter: RateLimiter) -> None:
         self._app = app
@@ -127,8 +98,7 @@ class RateLimitMiddleware:
             await self._app(scope, receive, send)
             return
         try:
-            size_bytes = self._content_length(caller, Headers(scope=scope))
-            rate_limit_headers = await run_in_threadpool(self._count, caller, size_bytes)
+            rate_limit_headers = await run_in_threadpool(self._limiter.count_request, caller)
         except PlacewiseError as error:
             await problem_response(error, Request(scope))(scope, receive, send)
             return
@@ -139,27 +109,6 @@ class RateLimitMiddleware:
             await send(message)
 
         await self._app(scope, receive, send_with_headers)
-
-    def _count(self, caller: Caller, size_bytes: int) -> dict[str, str]:
-        headers = self._limiter.count_request(caller)
-        self._limiter.count_upload_bytes(caller, size_bytes)
-        return headers
-
-    def _content_length(self, caller: Caller, headers: Headers) -> int:
-        """Size of the body by its headers; LengthRequired if a quota applies and it is unknown."""
-        content_length = headers.get("content-length")
-        if content_length is not None:
-            if not content_length.isdecimal():
-                raise InvalidRequest(
-                    "malformed_body", f"Content-Length is not a number: {content_length[:100]!r}."
-                )
-            return int(content_length)
-        if "transfer-encoding" in headers and self._limiter.daily_upload_bytes(caller) is not None:
-            raise LengthRequired(
-                "length_required",
-                "This key has a daily upload quota: send the size of the body in Content-Length.",
-            )
-        return 0
 
 
 def _open_limit_storage(settings: Settings) -> MemoryStorage | RedisStorage:

@@ -20,7 +20,6 @@ from shared.search_api.protocol import (
     EXHAUSTIVE,
     NONE,
     STATISTICAL,
-    Mode,
     SearchHit,
     SearchResponse,
 )
@@ -39,14 +38,6 @@ NO_ROWS = np.empty(0, np.int64)
 NO_SCORES = np.empty(0)
 
 
-@dataclass(frozen=True, slots=True)
-class SearchOptions:
-    """Number of results and strategy of a search."""
-
-    k: int
-    mode: Mode = Mode.AUTO
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _ScoredRows:
     """Rows with their exact scores, among them all that the result needs."""
@@ -62,7 +53,7 @@ def execute_query(
     snapshot: Snapshot,
     query: QueryRow,
     row_mask: NDArray[np.bool_],
-    options: SearchOptions,
+    k: int,
     batcher: QueryBatcher,
 ) -> SearchResponse:
     """Search the rows of a snapshot that are most similar to a query.
@@ -71,10 +62,10 @@ def execute_query(
         snapshot: The snapshot.
         query: (dimension,) row of any length; a row of zeros has no similar rows.
         row_mask: (n,) bool, the rows that may be returned.
-        options: Number of results and strategy.
+        k: Number of results.
         batcher: Batches the first-level scans of concurrent queries.
     """
-    search = _Query(snapshot, query, row_mask, options, batcher)
+    search = _Query(snapshot, query, row_mask, k, batcher)
     if not search.selected or not query.any():
         return search.to_response([], _ScoredRows(NO_ROWS, NO_SCORES, EXHAUSTIVE, 0))
     scored = search.score_rows()
@@ -96,27 +87,26 @@ class _Query:
     snapshot: Snapshot
     vector: QueryRow
     row_mask: NDArray[np.bool_]
-    options: SearchOptions
+    k: int
     batcher: QueryBatcher
 
     def score_rows(self) -> _ScoredRows:
         """Score the rows with the cheapest suitable strategy."""
-        snapshot, options, selected = self.snapshot, self.options, self.selected
+        snapshot, selected = self.snapshot, self.selected
         if (
-            options.mode == Mode.AUTO
-            and snapshot.has_sign_codes
-            and sign_codes_pay_off(selected, options.k)
+            snapshot.has_sign_codes
+            and sign_codes_pay_off(selected, self.k)
             and (scored := self._search_by_sign_codes()) is not None
         ):
             return scored
-        rows, scores = scan_top_k(snapshot, self.vector, options.k, self.row_mask)
+        rows, scores = scan_top_k(snapshot, self.vector, self.k, self.row_mask)
         return _ScoredRows(rows, scores, EXHAUSTIVE, selected)
 
     def rank_photos(self, scored: _ScoredRows) -> list[SearchHit]:
         """Return the hits, sorted by descending score, ties by photo id."""
-        options, rows, scores = self.options, scored.rows, round_scores(scored.scores)
-        if len(rows) > options.k:
-            kth = np.partition(scores, len(scores) - options.k)[len(scores) - options.k]
+        k, rows, scores = self.k, scored.rows, round_scores(scored.scores)
+        if len(rows) > k:
+            kth = np.partition(scores, len(scores) - k)[len(scores) - k]
             best = scores >= kth
             rows, scores = rows[best], scores[best]
         ranked: list[tuple[float, UUID]] = sorted(
@@ -124,9 +114,7 @@ class _Query:
             for score, photo_id in zip(scores.tolist(), self.snapshot.photos.ids(rows), strict=True)
             if photo_id is not None
         )
-        return [
-            SearchHit(photo_id=photo_id, score=-score) for score, photo_id in ranked[: options.k]
-        ]
+        return [SearchHit(photo_id=photo_id, score=-score) for score, photo_id in ranked[:k]]
 
     def to_response(self, hits: list[SearchHit], scored: _ScoredRows) -> SearchResponse:
         """Build the response; missing chunks may contain better rows."""
@@ -146,11 +134,10 @@ class _Query:
         from services.search.sign_code_search import SignCodedQuery, SignCodeSearch
         from shared.codes.rotation import get_rotation
 
-        options = self.options
         blocks = self.snapshot.sign_code_blocks
         coded = SignCodedQuery.of(self.vector, get_rotation(len(self.vector)))
         first = self.batcher.scan(blocks, coded, self.row_mask)
-        search = SignCodeSearch(blocks, coded, options.k, self.snapshot.prefetch_rows)
+        search = SignCodeSearch(blocks, coded, self.k, self.snapshot.prefetch_rows)
         result = search.search(first)
         if result.max_z > MAX_Z:
             return None

@@ -1,24 +1,19 @@
-"""Search service process: syncs with the catalog, sends heartbeats, and serves searches over HTTP.
+"""Search service process: syncs with the catalog, and serves searches over HTTP.
 
 The HTTP API is for the gateway and the steward only. It requires no API key and exposes which
-photos a map has: listen on an internal network. `WorkerHeartbeat` registers the worker in the
-catalog with the versions that it has loaded.
+photos a map has: listen on an internal network.
 """
 
 from __future__ import annotations
 
 import logging
-import socket
 import threading
-import time
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from uuid import UUID
 
 from fastapi import FastAPI, Response
 from prometheus_client import CollectorRegistry
 from pydantic import BaseModel
-from sqlalchemy.exc import SQLAlchemyError
 
 from services.http_connections import ConnectionLimits, Connections
 from services.http_server import http_server, listen, reachable_url, stop_on_signals
@@ -26,13 +21,10 @@ from services.request_log import RequestLogMiddleware
 from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
 from services.service_process import Announce, service_process, start_service_threads
-from shared.catalog.database.errors import OutageLog
-from shared.catalog.database.session import Catalog
 from shared.catalog.installation import open_installation_store
-from shared.catalog.processes import delete_search_worker, upsert_search_worker
+from shared.catalog.processes import process_heartbeat
 from shared.config.settings import Settings
 from shared.http.problem_details import PROBLEM_RESPONSES, install_exception_handlers
-from shared.ids import new_id
 from shared.search_api.protocol import (
     MatchRequest,
     MatchResponse,
@@ -144,51 +136,6 @@ def _check_readiness(worker: SearchWorker) -> Readiness:
     )
 
 
-CHANGE_POLL_SECONDS = 0.5  # polling interval; the activation of a generation waits for the news
-HEARTBEAT_SECONDS = 2.0  # interval without changes; DEAD_SECONDS is five of them
-
-
-class WorkerHeartbeat:
-    """Registers a search worker in the catalog and keeps its loaded versions up to date.
-
-    It runs in a thread of its own, because loading may take minutes while the worker is alive.
-    """
-
-    def __init__(self, catalog: Catalog, worker: SearchWorker, name: str) -> None:
-        self.id = new_id()
-        self._catalog = catalog
-        self._worker = worker
-        self._name = name
-        self._sent_versions: tuple[Mapping[UUID, int], Sequence[str]] | None = None
-        self._sent_at = 0.0
-
-    def run(self, stop: threading.Event) -> None:
-        """Send heartbeats until `stop` is set, then delete the entry."""
-        outage = OutageLog("search worker heartbeat")
-        while not stop.is_set():
-            try:
-                self.send_if_due()
-                outage.record_success()
-            except SQLAlchemyError as error:
-                outage.record_error(error)
-            stop.wait(CHANGE_POLL_SECONDS)
-        try:
-            with self._catalog.write() as session:
-                delete_search_worker(session, self.id)
-        except SQLAlchemyError as error:
-            log.warning("the worker's entry remains until the steward deletes it: %s", error)
-
-    def send_if_due(self) -> None:
-        """Write the entry if the loaded versions have changed, or a heartbeat is due."""
-        status = self._worker.status()
-        versions = status.loaded, status.missing
-        if versions == self._sent_versions and time.monotonic() - self._sent_at < HEARTBEAT_SECONDS:
-            return
-        with self._catalog.write(is_heartbeat=versions == self._sent_versions) as session:
-            upsert_search_worker(session, self.id, self._name, *versions)
-        self._sent_versions, self._sent_at = versions, time.monotonic()
-
-
 def serve_search(settings: Settings, announce: Announce) -> None:
     """Serve searches on HOST and PORT until SIGTERM.
 
@@ -203,7 +150,6 @@ def serve_search(settings: Settings, announce: Announce) -> None:
             registry = CollectorRegistry()
             worker = SearchWorker.from_settings(catalog, store, settings)
             url = reachable_url(host, port)
-            heartbeat = WorkerHeartbeat(catalog, worker, f"{socket.gethostname()}:{port}")
             # Its clients are a few gateways, with one connection for each concurrent query.
             limits = replace(ConnectionLimits.of(settings), per_address=0)
             server = http_server(create_search_app(worker, registry), Connections(limits))
@@ -211,12 +157,15 @@ def serve_search(settings: Settings, announce: Announce) -> None:
                 {
                     "search sync": worker.run,
                     "search sync of building generations": worker.run_building,
-                    "search heartbeat": heartbeat.run,
                 },
                 stop,
             )
             try:
-                with serve_metrics(settings, registry), stop_on_signals(server):
+                with (
+                    process_heartbeat(catalog, "search", worker.state),
+                    serve_metrics(settings, registry),
+                    stop_on_signals(server),
+                ):
                     announce(
                         f"Placewise search listens on {url}\n"
                         f"  health:   {url}/readyz   {url}/metrics"

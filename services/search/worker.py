@@ -27,7 +27,7 @@ from services.search.catalog_sync import (
     sync_snapshot,
 )
 from services.search.chunk_loader import list_generation_folders, remove_stale_folders
-from services.search.executor import SearchOptions, execute_query
+from services.search.executor import execute_query
 from services.search.photo_columns import build_row_mask
 from services.search.photo_matcher import PhotoMatcher
 from services.search.pose_estimator import PoseEstimator
@@ -292,6 +292,10 @@ class SearchWorker:
             lags=self.replication_lag.current_lags(versions),
         )
 
+    def state(self) -> dict[str, Any]:
+        """Return the versions that are loaded completely, as the process registers them."""
+        return {"loaded": {str(key): version for key, version in self.status().loaded.items()}}
+
     def snapshot(self, generation_id: UUID, min_version: int) -> Snapshot:
         """Return a snapshot at least as new as `min_version`.
 
@@ -360,8 +364,7 @@ class SearchWorker:
     def _find_rows(self, snapshot: Snapshot, query: Row, request: SearchRequest) -> SearchResponse:
         """Return the rows that are most similar to a query, (dimension,) float32."""
         row_mask = build_row_mask(snapshot.photos, request.photos, request.exclude)
-        options = SearchOptions(request.k, request.mode)
-        return execute_query(snapshot, query, row_mask, options, self.query_batcher)
+        return execute_query(snapshot, query, row_mask, request.k, self.query_batcher)
 
     def _list_stored(self) -> list[Any]:
         """List what is stored of any generation outside of this process."""

@@ -1,4 +1,4 @@
-"""Prometheus metrics of a steward: runs of periodic tasks, repairs, deletions and jobs."""
+"""Prometheus metrics of a steward: runs of periodic tasks, repairs and jobs."""
 
 from __future__ import annotations
 
@@ -43,9 +43,6 @@ class StewardMetrics:
         self.wakeups_resent = counter("wakeups_resent", "Wakeups sent again for waiting jobs.")
         self.compactions = counter("compactions", "Chunks that were merged into one, or rewritten.")
         self.journal_lines = counter("journal_lines", "Catalog rows written to the journal.")
-        self.objects_deleted = counter(
-            "objects_deleted", "Deleted objects that nothing referred to any more.", ["task"]
-        )
         self.objects_trashed = counter("objects_trashed", "Orphaned objects moved to the trash.")
         self.collection_held = gauge(
             "collection_held",

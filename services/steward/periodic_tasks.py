@@ -51,15 +51,11 @@ def periodic_task(interval_seconds: float, **options: Any) -> Callable[[Function
     return register
 
 
-def registered_tasks(
-    resources: Mapping[str, Any], store_of_task: Callable[[str], object]
-) -> list[PeriodicTask]:
+def registered_tasks(resources: Mapping[str, Any]) -> list[PeriodicTask]:
     """Return the registered tasks, with their parameters taken from the resources."""
     tasks = []
     for function, options in _REGISTERED:
-        name = function.__name__
-        named = {**resources, "store": store_of_task(name)}
-        parameters = inspect.signature(function).parameters.keys() & named.keys()
-        run = partial(function, **{parameter: named[parameter] for parameter in parameters})
-        tasks.append(PeriodicTask(name, run=run, **options))
+        parameters = inspect.signature(function).parameters.keys() & resources.keys()
+        run = partial(function, **{parameter: resources[parameter] for parameter in parameters})
+        tasks.append(PeriodicTask(function.__name__, run=run, **options))
     return tasks

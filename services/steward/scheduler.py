@@ -8,8 +8,6 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
-from typing import Any
 
 from prometheus_client import CollectorRegistry
 from sqlalchemy.exc import SQLAlchemyError
@@ -21,7 +19,6 @@ import services.steward.tasks.auto_fit
 import services.steward.tasks.compaction
 import services.steward.tasks.delete_maps
 import services.steward.tasks.garbage_collection
-import services.steward.tasks.generation_repair
 import services.steward.tasks.maintenance
 import services.steward.tasks.model_changes
 import services.steward.tasks.reindex_jobs  # noqa: F401  (they register their tasks)
@@ -33,32 +30,15 @@ from services.steward.tasks.orphans import (
     empty_expired_trash,
 )
 from shared.catalog.database.errors import OutageLog
-from shared.catalog.database.schema import sqlite_file
 from shared.catalog.database.session import IDLE_SECONDS, Catalog, ChangePoll
-from shared.config.disk_space import DiskReserve
 from shared.config.settings import Settings
 from shared.jobs import Wakeups
 from shared.journal.outbox import write_journal, write_snapshot
-from shared.storage import ObjectStore, OwnedStore
+from shared.storage import OwnedStore
 from shared.storage.read_retries import ReadRetries
 from shared.telemetry.heartbeat import Heartbeat
 
 log = logging.getLogger(__name__)
-
-
-class _DeletionCountingStore:
-    """Forwards to an object store and calls `on_delete` after each deletion."""
-
-    def __init__(self, store: ObjectStore, on_delete: Callable[[], object]) -> None:
-        self._store = store
-        self._on_delete = on_delete
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._store, name)
-
-    def delete(self, key: str) -> None:
-        self._store.delete(key)
-        self._on_delete()
 
 
 SCHEDULER_TICK_SECONDS = 0.25
@@ -86,11 +66,9 @@ class Scheduler:
         self._outage = OutageLog("steward")
         self._heartbeat = Heartbeat(settings.heartbeat_file)
 
-        def counting_store(task: str) -> _DeletionCountingStore:
-            return _DeletionCountingStore(store, metrics.objects_deleted.labels(task).inc)
-
         resources = {
             "catalog": catalog,
+            "store": store,
             "wakeups": wakeups,
             "settings": settings,
             "retries": ReadRetries(),
@@ -103,7 +81,7 @@ class Scheduler:
             counter="journal_lines",
         )
         self.tasks = [
-            *registered_tasks(resources, counting_store),
+            *registered_tasks(resources),
             self._journal,
             PeriodicTask(
                 "write_snapshot", 60.0, lambda: write_snapshot(catalog, store), own_thread=True
@@ -117,16 +95,10 @@ class Scheduler:
             PeriodicTask(
                 "free_trash",
                 10.0,
-                lambda: metrics.objects_deleted.labels("free_trash").inc(
-                    store.free_trash(FREE_TRASH_FACTOR * settings.min_free_bytes)
-                ),
+                lambda: store.free_trash(FREE_TRASH_FACTOR * settings.min_free_bytes),
                 uses_catalog=False,
             ),
         ]
-        # On the disk of the SQLite file; PostgreSQL reserves its own space.
-        if (catalog_file := sqlite_file(catalog)) is not None:
-            reserve = DiskReserve(catalog_file.parent, settings.min_free_bytes)
-            self.tasks.insert(0, PeriodicTask("keep_disk_reserve", 5.0, reserve.maintain))
 
     def run(self, stop: threading.Event) -> None:
         """Run due tasks until `stop` is set; then write the pending rows to the journal."""
@@ -194,6 +166,4 @@ def _collect_orphans(
         return
     metrics.collection_held.set(0)
     metrics.objects_trashed.inc(moved)
-    deleted, remaining_bytes = empty_expired_trash(catalog, store, settings.trash_days)
-    metrics.objects_deleted.labels("collect_orphans").inc(deleted)
-    metrics.trash_bytes.set(remaining_bytes)
+    metrics.trash_bytes.set(empty_expired_trash(catalog, store, settings.trash_days))

@@ -31,8 +31,6 @@ from shared.errors import NotFound, Unauthorized, invalid_field_error
 from shared.ids import new_id
 from shared.security.api_keys import Scope, api_key_prefix, generate_api_key, hash_api_key
 
-LAST_USED_RESOLUTION_SECONDS = 60.0  # of `last_used_at`
-
 
 class ApiKey(Journaled, Base):
     """An API key. A limit that is null defaults to the one of the settings."""
@@ -46,7 +44,6 @@ class ApiKey(Journaled, Base):
     scopes: Mapped[list[str]] = mapped_column(JsonValue)
     maps: Mapped[list[str] | None] = mapped_column(JsonValue)  # names; None: all maps
     requests_per_minute: Mapped[int | None] = mapped_column(Integer)
-    upload_bytes_per_day: Mapped[int | None] = mapped_column(BigInteger)
     max_photos: Mapped[int | None] = mapped_column(BigInteger)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     expires_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
@@ -59,7 +56,6 @@ class KeyLimits:
     """Rate limit and quotas of a key; None defaults to the limit of the settings."""
 
     requests_per_minute: int | None = None
-    upload_bytes_per_day: int | None = None
     max_photos: int | None = None
 
 
@@ -102,7 +98,6 @@ def create_api_key(
         maps=None if maps is None else sorted(set(maps)),
         expires_at=None if life_seconds is None else db_now_plus(life_seconds),
         requests_per_minute=limits.requests_per_minute,
-        upload_bytes_per_day=limits.upload_bytes_per_day,
         max_photos=limits.max_photos,
     )
     session.add(row)
@@ -162,16 +157,10 @@ def has_admin_key(session: Session) -> bool:
 
 
 def record_key_use(session: Session, key_id: UUID) -> None:
-    """Set `last_used_at`, at most once per LAST_USED_RESOLUTION_SECONDS."""
+    """Set `last_used_at` to now."""
     session.execute(
         update(ApiKey)
-        .where(
-            ApiKey.id == key_id,
-            or_(
-                ApiKey.last_used_at.is_(None),
-                ApiKey.last_used_at < db_now_plus(-LAST_USED_RESOLUTION_SECONDS),
-            ),
-        )
+        .where(ApiKey.id == key_id)
         # `revision` is set explicitly: otherwise the journal would record each use.
         .values(last_used_at=db_now(), revision=ApiKey.revision)
         .execution_options(synchronize_session=False)

@@ -1,11 +1,8 @@
-"""Registry and heartbeats of running processes and of search workers.
+"""Registry and heartbeats of running processes.
 
-The registry of gateways, extractors and stewards is informational, for `GET /health` and operators;
-leases decide which worker owns a job.
-
-Search workers have a registry of their own with the versions that they have loaded, updated about
-every second or two. A generation is activated only once every live worker has registered it as
-loaded.
+That of gateways, extractors and stewards is informational, for `GET /health` and operators; leases
+decide which worker owns a job. Search workers register the versions that they have loaded: a
+generation is activated only once every live worker has loaded it.
 """
 
 from __future__ import annotations
@@ -16,7 +13,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from importlib.metadata import version
@@ -31,7 +28,6 @@ from shared.catalog.database.base import (
     Base,
     JsonValue,
     UtcDateTime,
-    affected_rows,
     db_now,
     db_now_plus,
 )
@@ -90,17 +86,19 @@ def process_heartbeat(
     outage = OutageLog(f"{role}'s heartbeat")
 
     def send_heartbeats() -> None:
+        registered = None
         while not stop.is_set():
             state = read_state()
             try:
-                with catalog.write(is_heartbeat=True) as session:
-                    _upsert_process(session, process_id, role, name, state)
+                with catalog.write(is_heartbeat=state == registered) as session:
+                    upsert_process(session, process_id, role, name, state)
+                registered = state
                 outage.record_success()
             except SQLAlchemyError as error:
                 outage.record_error(error)
             next_beat = time.monotonic() + PROCESS_HEARTBEAT_SECONDS
             while time.monotonic() < next_beat and not stop.wait(STATE_POLL_SECONDS):
-                if read_state() != state:
+                if read_state() != registered:
                     break
 
     thread = threading.Thread(target=send_heartbeats, name="heartbeat", daemon=True)
@@ -117,9 +115,10 @@ def process_heartbeat(
             log.info("this process could not be unregistered: %s", error)
 
 
-def _upsert_process(
+def upsert_process(
     session: Session, process_id: UUID, role: str, name: str, state: dict[str, Any] | None
 ) -> None:
+    """Write a heartbeat of the process."""
     updated = session.execute(
         update(RegisteredProcess)
         .where(RegisteredProcess.id == process_id)
@@ -146,9 +145,9 @@ def _upsert_process(
         )
 
 
-def delete_processes(session: Session, role: str) -> None:
-    """Unregister all processes of a role, where none can be running."""
-    session.execute(delete(RegisteredProcess).where(RegisteredProcess.role == role))
+def delete_processes(session: Session) -> None:
+    """Unregister all processes, where none can be running."""
+    session.execute(delete(RegisteredProcess))
 
 
 def list_processes(session: Session) -> list[ProcessStatus]:
@@ -171,85 +170,15 @@ def list_processes(session: Session) -> list[ProcessStatus]:
     ]
 
 
-UNREADABLE = "unreadable"
-"""Key in `loaded`, next to the generations: the keys of the chunks that the worker can't read."""
+def list_lagging_search_workers(session: Session, generation_id: UUID, version: int) -> list[str]:
+    """Return the names of the live search workers that have not loaded the generation at `version`.
 
-# Several heartbeats: a worker without one for longer is dead and does not block activations.
-SEARCH_WORKER_TIMEOUT_SECONDS = 10.0
-
-
-class RegisteredSearchWorker(Base):
-    """A search worker process.
-
-    `loaded` maps generation ids to the map version up to which all chunks are loaded; it also has
-    the key `UNREADABLE`.
+    Their state has the map version up to which all chunks are loaded, by generation.
     """
-
-    __tablename__ = "search_workers"
-
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
-    name: Mapped[str] = mapped_column(String(200))
-    loaded: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
-    seen_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
-
-    def has(self, generation_id: UUID, version: int) -> bool:
-        """Return whether it has loaded the generation at this version or a later one."""
-        return int(self.loaded.get(str(generation_id), -1)) >= version
-
-
-def upsert_search_worker(
-    session: Session,
-    worker_id: UUID,
-    name: str,
-    loaded: Mapping[UUID, int],
-    unreadable: Sequence[str] = (),
-) -> None:
-    """Write a heartbeat of the worker with its loaded versions and its unreadable chunks."""
-    versions: dict[str, Any] = {str(id_): version for id_, version in loaded.items()}
-    if unreadable:
-        versions[UNREADABLE] = list(unreadable)
-    updated = session.execute(
-        update(RegisteredSearchWorker)
-        .where(RegisteredSearchWorker.id == worker_id)
-        .values(loaded=versions, seen_at=db_now())
-        .execution_options(synchronize_session=False)
-    )
-    if not affected_rows(updated):  # new, or removed while it could not reach the catalog
-        session.add(RegisteredSearchWorker(id=worker_id, name=name, loaded=versions))
-
-
-def delete_search_worker(session: Session, worker_id: UUID) -> None:
-    """Unregister a worker that shuts down."""
-    session.execute(delete(RegisteredSearchWorker).where(RegisteredSearchWorker.id == worker_id))
-
-
-def delete_dead_search_workers(session: Session, *, all_workers: bool = False) -> int:
-    """Unregister dead workers, or all of them where none can be running; return their number."""
-    dead = delete(RegisteredSearchWorker)
-    if not all_workers:
-        dead = dead.where(
-            RegisteredSearchWorker.seen_at < db_now_plus(-SEARCH_WORKER_TIMEOUT_SECONDS)
-        )
-    return affected_rows(session.execute(dead))
-
-
-def unreadable_keys(session: Session) -> set[str]:
-    """Return the keys of the chunks that a live worker reports as unreadable."""
-    live = session.scalars(
-        select(RegisteredSearchWorker.loaded).where(
-            RegisteredSearchWorker.seen_at >= db_now_plus(-SEARCH_WORKER_TIMEOUT_SECONDS)
-        )
-    )
-    return {key for loaded in live for key in loaded.get(UNREADABLE, ())}
-
-
-def list_lagging_workers(
-    session: Session, generation_id: UUID, version: int
-) -> list[RegisteredSearchWorker]:
-    """List the live workers that have not loaded the generation at `version` yet, by name."""
-    live = session.scalars(
-        select(RegisteredSearchWorker)
-        .where(RegisteredSearchWorker.seen_at >= db_now_plus(-SEARCH_WORKER_TIMEOUT_SECONDS))
-        .order_by(RegisteredSearchWorker.name, RegisteredSearchWorker.id)
-    )
-    return [worker for worker in live if not worker.has(generation_id, version)]
+    return [
+        process.name
+        for process in list_processes(session)
+        if process.role == "search"
+        and process.is_live
+        and process.state["loaded"].get(str(generation_id), -1) < version
+    ]

@@ -64,15 +64,9 @@ class GatewaySettings(BaseSettings):
         "user: *:read, editors:write, vpr-admins:admin",
     )
 
-    # Rate limit and quotas of keys that have none of their own. ADMIN_KEY is not limited.
+    # Rate limit and quota of keys that have none of their own. ADMIN_KEY is not limited.
     key_requests_per_minute: int | None = Field(
         None, ge=1, description="rate limit of one key, requests per minute; unset: no limit"
-    )
-    key_upload_bytes_per_day: Size | None = Field(
-        None,
-        ge=1,
-        description="bytes of request bodies that one key may send in 24 hours, whether or not "
-        "they are stored; unset: no limit",
     )
     key_max_photos: int | None = Field(
         None, ge=1, description="photos that one key may store; unset: no limit"

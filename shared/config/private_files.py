@@ -6,7 +6,7 @@ import contextlib
 import errno
 import os
 from pathlib import Path
-from typing import BinaryIO, TextIO
+from typing import BinaryIO
 
 FOLDER_MODE = 0o700
 FILE_MODE = 0o600
@@ -30,12 +30,6 @@ def create_private_file(file: Path, buffering: int = -1) -> BinaryIO:
     """Open the file for writing and truncate it; a new file has mode 0600."""
     descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, FILE_MODE)
     return os.fdopen(descriptor, "wb", buffering)
-
-
-def append_to_private_file(file: Path) -> TextIO:
-    """Open the file for appending UTF-8 text; a new file has mode 0600."""
-    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND, FILE_MODE)
-    return os.fdopen(descriptor, "a", encoding="utf-8")
 
 
 def write_private(file: Path, text: str) -> None:

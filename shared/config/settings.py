@@ -63,11 +63,6 @@ class ServiceSettings(BaseSettings):
     log_format: Literal["text", "json"] = Field(
         "text", description="log format; json writes one JSON object per line"
     )
-    log_file: Path | None = Field(
-        None,
-        description="file of the log of one service, beside stderr; services on one machine need "
-        "different files; unset: stderr only",
-    )
     metrics_port: int | None = Field(
         None,
         ge=0,

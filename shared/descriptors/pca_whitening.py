@@ -1,4 +1,4 @@
-"""PCA whitening of descriptors: projection, file format and validation.
+"""PCA whitening of descriptors: projection and file format.
 
 As in Jegou and Chum (Negative evidences and co-occurrences in image retrieval, ECCV 2012), and as
 AnyLoc's PCA rows (RA-L 2023: whitened, then L2-normalised again). For n database rows x_i with mean
@@ -10,7 +10,7 @@ X'X / (n - 1) and the unit directions p_j:
 `shared.descriptors.pca_fit` computes mean and directions.
 
 Files are safetensors. `spec` in the header's `__metadata__`, a string of JSON, is the extractor
-spec (`Extractor.spec`) of the rows that the whitening was fitted on. It is optional.
+spec (`Extractor.spec`) of the rows that the whitening was fitted on.
 """
 
 from __future__ import annotations
@@ -99,8 +99,6 @@ def _tensor(array: Rows) -> torch.Tensor:
     return torch.from_numpy(np.require(array, requirements=["C", "W"]))
 
 
-TENSOR_NAMES = ("mean", "directions", "variances", "explained", "rows")
-
 # Fields that change only the last bits of a descriptor; a whitening stays valid.
 IGNORED_SPEC_FIELDS = ("decoder", "precision")
 
@@ -110,8 +108,8 @@ class PcaWhiteningFile:
     """A whitening with the extractor spec of the rows that it was fitted on."""
 
     whitening: PcaWhitening
-    spec: dict[str, Any] | None
-    """Extractor spec of those rows; None if unknown."""
+    spec: dict[str, Any]
+    """Extractor spec of those rows."""
 
     def encode(self) -> bytes:
         """Encode as a `.safetensors` file."""
@@ -124,24 +122,16 @@ class PcaWhiteningFile:
                 "explained": np.array([whitening.explained], dtype=np.float64),
                 "rows": np.array([whitening.rows], dtype=np.int64),
             },
-            None if self.spec is None else {"spec": json.dumps(self.spec, sort_keys=True)},
+            {"spec": json.dumps(self.spec, sort_keys=True)},
         )
 
     def check_compatible(self, spec: dict[str, Any]) -> None:
         """Check that the whitening was fitted on descriptors of the extractor spec `spec`.
 
-        `spec` is that of descriptors before projection. If the spec of the fitted rows is unknown,
-        only the dimension is compared.
+        `spec` is that of descriptors before projection.
 
         Raises Unprocessable (`pca_unusable`) naming the differences.
         """
-        if self.whitening.dimension != spec["dimension"]:
-            raise _pca_unusable_error(
-                f"it projects descriptors of {self.whitening.dimension} dimensions, but these "
-                f"have {spec['dimension']}"
-            )
-        if self.spec is None:
-            return
         differing = [
             f"{key} is {spec.get(key)!r}, was {self.spec.get(key)!r}"
             for key in sorted(spec.keys() | self.spec.keys())
@@ -154,7 +144,7 @@ class PcaWhiteningFile:
 
 
 def decode_whitening(data: bytes) -> PcaWhiteningFile:
-    """Decode and validate a PCA file.
+    """Decode the file of a whitening, which the caller verifies by its hash.
 
     Raises Unprocessable (`pca_unusable`) with the reason.
     """
@@ -164,66 +154,15 @@ def decode_whitening(data: bytes) -> PcaWhiteningFile:
         raise _pca_unusable_error(
             f"it is not a safetensors file, or it is truncated ({error})"
         ) from error
-    return PcaWhiteningFile(_whitening(stored), _spec(data))
-
-
-def _spec(data: bytes) -> dict[str, Any] | None:
-    """Return the spec of a valid file's header; None if it has none."""
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
-    text = header.get("__metadata__", {}).get("spec")
-    if text is None:
-        return None
-    try:
-        spec = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise _pca_unusable_error(f"its spec can't be read ({error})") from error
-    if not isinstance(spec, dict):
-        raise _pca_unusable_error("its spec is not a JSON object")
-    return spec
-
-
-def _whitening(stored: dict[str, NDArray[np.generic]]) -> PcaWhitening:
-    missing = [name for name in TENSOR_NAMES if name not in stored]
-    if missing:
-        raise _pca_unusable_error(f"it has no {', '.join(missing)}")
-    mean, directions, variances = (_floats(stored, name) for name in TENSOR_NAMES[:3])
-    shapes = (mean.shape, variances.shape)
-    if directions.ndim != 2 or shapes != (directions.shape[1:], directions.shape[:1]):
-        raise _pca_unusable_error(
-            f"its mean {mean.shape}, directions {directions.shape} and variances "
-            f"{variances.shape} do not match: (D,), (d, D) and (d,) are expected"
-        )
-    components, dimension = directions.shape
-    if not 0 < components <= dimension:
-        raise _pca_unusable_error(f"it projects {dimension} dimensions to {components}")
-    if not (variances > 0).all():
-        raise _pca_unusable_error("a variance is not positive")
-    # Unit directions divided by their standard deviation, within the precision of float32.
-    lengths = np.linalg.norm(directions, axis=1) * np.sqrt(variances)
-    if not np.allclose(lengths, 1.0, rtol=0.01):
-        raise _pca_unusable_error("its directions do not match its variances")
-    try:
-        return PcaWhitening(
-            mean,
-            directions,
-            variances,
-            explained=float(stored["explained"].item()),
-            rows=int(stored["rows"].item()),
-        )
-    except ValueError as error:
-        raise _pca_unusable_error(
-            f"explained and rows must be one number each ({error})"
-        ) from error
-
-
-def _floats(stored: dict[str, NDArray[np.generic]], name: str) -> NDArray[np.float32]:
-    array = stored[name]
-    if array.dtype != np.float32:
-        raise _pca_unusable_error(f"its {name} is {array.dtype}, not float32")
-    floats = array.astype(np.float32, copy=False)
-    if not np.isfinite(floats).all():
-        raise _pca_unusable_error(f"its {name} holds NaN or infinite numbers")
-    return floats
+    whitening = PcaWhitening(
+        np.asarray(stored["mean"], np.float32),
+        np.asarray(stored["directions"], np.float32),
+        np.asarray(stored["variances"], np.float32),
+        explained=float(stored["explained"].item()),
+        rows=int(stored["rows"].item()),
+    )
+    return PcaWhiteningFile(whitening, json.loads(header["__metadata__"]["spec"]))
 
 
 def _pca_unusable_error(reason: str) -> Unprocessable:

@@ -94,12 +94,6 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def file_state(path: Path) -> str:
-    """Return a key of a file that changes with its content: path, size and time of change."""
-    stat = path.stat()
-    return f"{path} {stat.st_size} {stat.st_mtime_ns}"
-
-
 def _resume_download(client: httpx2.Client, url: str, part: Path, on_progress: OnProgress) -> None:
     """Append one response to `part`, from its end on; raise if it is incomplete."""
     etag = _sibling_path(part, ".etag")

@@ -13,7 +13,6 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pymap3d import ecef2geodetic, enu2geodetic, geodetic2ecef, geodetic2enu
 
 from shared.errors import Unprocessable
 from shared.geometry.cameras import Floats
@@ -70,11 +69,15 @@ class EastNorthUp:
 
     def from_geographic(self, latitudes: Any, longitudes: Any, altitudes_m: Any) -> Floats:
         """Return the (n, 3) metres of (n,) degrees, degrees and metres."""
+        from pymap3d import geodetic2enu
+
         places = (np.asarray(values, float) for values in (latitudes, longitudes, altitudes_m))
         return np.stack(geodetic2enu(*places, *self._point), axis=-1)
 
     def to_geographic(self, metres: Floats) -> EastNorthUp:
         """Return the point (3,) with the plane that touches the ellipsoid there."""
+        from pymap3d import enu2geodetic
+
         return EastNorthUp(*map(float, enu2geodetic(*metres, *self._point)))
 
     @property
@@ -293,6 +296,8 @@ def _level(axes: Floats) -> Floats:
 
 def plane_at(latitudes: Floats, longitudes: Floats, altitude_m: float) -> EastNorthUp:
     """Return the plane at the middle of the places, also around a pole or the antimeridian."""
+    from pymap3d import ecef2geodetic, geodetic2ecef
+
     earth_centred = geodetic2ecef(latitudes, longitudes, np.zeros(len(latitudes)))
     latitude, longitude, _ = ecef2geodetic(*np.median(earth_centred, axis=1))
     return EastNorthUp(float(latitude), float(longitude), altitude_m)

@@ -15,7 +15,7 @@ from shared.geometry.absolute_pose import AbsolutePose, LensSigmas, estimate_abs
 from shared.geometry.cameras import Camera, CameraSource, Floats
 from shared.geometry.component import Component
 from shared.matching.features import LocalFeatures
-from shared.matching.matchers import Matcher
+from shared.matching.matchers import MutualNearest
 
 MIN_INLIERS = 30
 MIN_INLIER_SHARE = 0.25
@@ -93,7 +93,7 @@ def localise(
     components: Sequence[Component],
     camera: Camera | None,
     camera_source: CameraSource,
-    matcher: Matcher,
+    matcher: MutualNearest,
     leave_out: AbstractSet[UUID] = frozenset(),
 ) -> LocalPose:
     """Return the pose of a photo; Unprocessable (`no_pose`) says why it has none.
@@ -271,7 +271,7 @@ def _match(
     pixels: Floats,
     group: Sequence[tuple[int, int, LocalFeatures]],
     components: Sequence[Component],
-    matcher: Matcher,
+    matcher: MutualNearest,
     leave_out: AbstractSet[UUID],
 ) -> _Pairs:
     """Match the query with the photos of a place; each pair counts once.

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from pygeomag import GeoMag
-
 MAX_ALTITUDE_M = 100_000
 MAX_HEADING = 720  # cameras count on beyond a turn, but not beyond two
 BELOW_ZERO = ("1", "3")  # GPSAltitudeRef: below the sea, below the ellipsoid
@@ -88,6 +86,8 @@ def true_heading(place: CapturePlace, time: datetime | None) -> float | None:
         return place.heading
     if place.latitude is None or place.longitude is None or time is None:
         return None
+    from pygeomag import GeoMag  # few photos need it
+
     try:
         model = GeoMag(base_year=time)  # a new one: it keeps sums, and other threads read photos
         year = time.year + (time.timetuple().tm_yday - 1) / 366

@@ -291,7 +291,9 @@ def discard_chunk(session: Session, chunk_id: UUID) -> int:
     increment_map_version(session, generation.map_id)
     if generation.state == GenerationState.ACTIVE:
         return _queue_photos(session, photo_ids)
-    # In a generation being built, the steward queues the photos of cancelled jobs again.
+    # In a generation being built, the steward queues the photos of cancelled jobs again, and search
+    # workers have to load them before it is activated.
+    generation.complete_version = generation.complete_at = None
     session.execute(
         update(Job)
         .where(

@@ -56,9 +56,9 @@ class PolledValue(Generic[T]):
 
     def get(self) -> T:
         """Return the value."""
-        if self.is_due() and self._lock.acquire(blocking=self._next_poll is None):
+        if self._is_due() and self._lock.acquire(blocking=self._next_poll is None):
             try:
-                if self.is_due():  # otherwise another thread has polled meanwhile
+                if self._is_due():  # otherwise another thread has polled meanwhile
                     started = time.monotonic()
                     self._value = self._poll()
                     elapsed = time.monotonic() - started
@@ -68,8 +68,7 @@ class PolledValue(Generic[T]):
                 self._lock.release()
         return self._value
 
-    def is_due(self) -> bool:
-        """Return whether `get` would poll now."""
+    def _is_due(self) -> bool:
         return self._next_poll is None or time.monotonic() >= self._next_poll
 
 

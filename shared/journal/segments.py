@@ -36,7 +36,7 @@ from shared.catalog.api_keys import ApiKey
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.database.base import Base, Journaled, from_json, to_json
 from shared.catalog.generations import Evaluation, Generation
-from shared.catalog.idempotency import IdempotencyRecord
+from shared.catalog.idempotency import StoredResponse
 from shared.catalog.jobs import Job
 from shared.catalog.maps import Map, Search
 from shared.catalog.models import Model
@@ -85,7 +85,7 @@ SNAPSHOT_TABLES: dict[str, type[Base]] = {
     "jobs": Job,
     "batch_items": BatchItem,
     "webhook_deliveries": Delivery,
-    "idempotency_keys": IdempotencyRecord,
+    "idempotency_keys": StoredResponse,
     "searches": Search,
     "tracks": Track,
     "track_frames": TrackFrame,

@@ -1,6 +1,6 @@
 """Local features: keypoints with descriptors, their matches, and the verification of matches.
 
 `features` is the stored form, `detectors` computes it (torch), `matchers` pairs the keypoints of
-two photos (NumPy; `lightglue`: torch), and `verification` tells which pairs agree with one camera
+two photos (NumPy), and `verification` tells which pairs agree with one camera
 motion.
 """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +20,6 @@ Matches = NDArray[np.intp]
 """(m, 2) numbers of the keypoints in the first and in the second photo"""
 
 
-class Matcher(Protocol):
-    """Pairs the keypoints of two photos."""
-
-    def match(self, first: LocalFeatures, second: LocalFeatures) -> Matches:
-        """Return the pairs, best first; each keypoint is in at most one."""
-
-
 @dataclass(frozen=True, slots=True)
 class MutualNearest:
     """Keypoints that are each other's nearest by cosine similarity, if it exceeds a minimum."""
@@ -40,7 +32,7 @@ class MutualNearest:
         return cls(MIN_COSINES.get(model.partition("@")[0], DEFAULT_MIN_COSINE))
 
     def match(self, first: LocalFeatures, second: LocalFeatures) -> Matches:
-        """Return the mutual nearest pairs, most similar first."""
+        """Return the pairs, most similar first; each keypoint is in at most one."""
         if not len(first.descriptors) or not len(second.descriptors):
             return np.empty((0, 2), dtype=np.intp)
         products = _multiply(first.descriptors, second.descriptors)

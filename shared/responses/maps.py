@@ -229,7 +229,6 @@ class KeyResponse(ResponseModel):
     scopes: list[Annotated[Scope, OPEN]]
     maps: list[str] | None = Field(description="the only maps that it may use; null: all maps")
     requests_per_minute: int | None
-    upload_bytes_per_day: int | None
     max_photos: int | None
     created_at: datetime
     expires_at: datetime | None

@@ -7,7 +7,6 @@ vector passes through the gateway. `SearchBackend` is implemented in process by
 
 from __future__ import annotations
 
-from enum import StrEnum
 from typing import Any, Protocol
 from uuid import UUID
 
@@ -24,13 +23,6 @@ NONE = "none"  # a part of the map is missing: better rows may exist
 
 CERTIFICATES = (EXHAUSTIVE, STATISTICAL, APPROXIMATE, NONE)
 """Guarantees of a result's completeness, strongest first."""
-
-
-class Mode(StrEnum):
-    """Search strategy."""
-
-    AUTO = "auto"  # the strategy that reads the fewest bytes
-    DENSE = "dense"  # compare every row exactly
 
 
 class _Message(BaseModel):
@@ -70,7 +62,6 @@ class SearchRequest(_Message):
     k: int = Field(ge=1)
     photos: PhotoFilter = NO_FILTER
     exclude: tuple[UUID, ...] = ()
-    mode: Mode = Mode.AUTO
     background: tuple[RowReference, ...] = ()
 
 

@@ -68,17 +68,12 @@ class FeatureRows:
 
 def encode_feature_file(features: FeatureRows, key: str) -> bytes:
     """Encode a feature file that will be stored as `key`."""
-    index = encode_feature_index(features.model, list(map(len, features.rows)), key)
-    return b"".join([index, *features.rows])
-
-
-def encode_feature_index(model: str, sizes: Sequence[int], key: str) -> bytes:
-    """Encode the start of a feature file whose rows have these sizes in bytes."""
-    name = key.rpartition("/")[2]
-    header = json.dumps({"format": 1, "model": model, "rows": len(sizes), "name": name}).encode()
+    name, sizes = key.rpartition("/")[2], list(map(len, features.rows))
+    fields = {"format": 1, "model": features.model, "rows": len(sizes), "name": name}
+    header = json.dumps(fields).encode()
     start = _START.pack(MAGIC, len(header)) + header
     offsets = np.cumsum([len(start) + 8 * (len(sizes) + 1), *sizes])
-    return start + offsets.astype("<u8").tobytes()
+    return b"".join([start, offsets.astype("<u8").tobytes(), *features.rows])
 
 
 def read_feature_index(store: ObjectStore, key: str) -> FeatureIndex:

@@ -12,7 +12,7 @@ import logging
 import os
 import shutil
 import stat
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
@@ -78,7 +78,6 @@ class FolderStore:
         return FolderWriter(
             folder.joinpath(*parts),
             folder / PARTIAL_FOLDER / str(new_id()),
-            lambda: self._empty_trash(folder) > 0,
         )
 
     def put(self, key: str, data: bytes) -> None:
@@ -150,7 +149,7 @@ class FolderStore:
             _sync_folder(folder)
 
     def free_trash(self, min_free_bytes: int) -> int:
-        return sum(self._empty_trash(folder, min_free_bytes) for folder in self._folders())
+        return sum(self._free_trash(folder, min_free_bytes) for folder in self._folders())
 
     def read_note(self, name: str) -> bytes | None:
         try:
@@ -209,16 +208,16 @@ class FolderStore:
     def _trash_of(self, folder: Path) -> Path:
         return folder / (TRASH.rstrip("/") if folder == self.root else SEPARATE_TRASH)
 
-    def _empty_trash(self, folder: Path, min_free_bytes: int | None = None) -> int:
-        """Delete the trash of this folder, oldest day first; return the number of files.
+    def _free_trash(self, folder: Path, min_free_bytes: int) -> int:
+        """Delete the trash of this folder, oldest day first, until its disk has this much free.
 
-        With `min_free_bytes`, stop when its disk has this much free.
+        Returns:
+            The number of deleted files.
         """
         trash, deleted = self._trash_of(folder), 0
         with contextlib.suppress(*NOT_FOUND_ERRORS):
             for day in sorted(trash.iterdir()):
-                free = shutil.disk_usage(folder).free
-                if min_free_bytes is not None and free >= min_free_bytes:
+                if shutil.disk_usage(folder).free >= min_free_bytes:
                     break
                 for directory, _, names in os.walk(day):
                     for name in names:
@@ -285,19 +284,14 @@ def _disk_full_error() -> StorageFull:
 
 
 class FolderWriter:
-    """Writes a partial file and renames it on `commit`.
-
-    On a full disk it calls `free_space` and continues while that returns True.
-    """
+    """Writes a partial file and renames it on `commit`."""
 
     @_raise_storage_full()
-    def __init__(self, target: Path, partial: Path, free_space: Callable[[], bool]) -> None:
+    def __init__(self, target: Path, partial: Path) -> None:
         self._target = target
         self._partial = partial
-        self._free_space = free_space
-        while shutil.disk_usage(partial.parent).free < RESERVED_FREE_BYTES:
-            if not free_space():
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if shutil.disk_usage(partial.parent).free < RESERVED_FREE_BYTES:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         # Unbuffered: closing the file must not retry a write that a full disk rejected.
         self._file = create_private_file(partial, buffering=0)
 
@@ -305,11 +299,7 @@ class FolderWriter:
     def write(self, data: bytes) -> None:
         remaining = memoryview(data)
         while remaining:
-            try:
-                remaining = remaining[self._file.write(remaining) :]
-            except OSError as error:
-                if error.errno not in DISK_FULL or not self._free_space():
-                    raise
+            remaining = remaining[self._file.write(remaining) :]
 
     @_raise_storage_full()
     def commit(self) -> None:

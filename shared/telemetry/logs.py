@@ -14,19 +14,13 @@ import logging
 import re
 from collections.abc import Callable
 from datetime import UTC, datetime
-from logging.handlers import RotatingFileHandler
-from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
-from shared.config.private_files import append_to_private_file, make_private_folder
 from shared.config.settings import Settings
-from shared.errors import Misconfigured
 from shared.telemetry.tracing import current_request_id, current_trace_id
 
 TEXT_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 OWN_LOGGERS = ("lab", "services", "shared")
-LOG_FILE_BYTES = 10_000_000  # at which LOG_FILE is renamed to LOG_FILE.1
-ROTATED_LOG_FILES = 5
 # Third-party loggers, limited to warnings.
 QUIET_LOGGERS = (
     "alembic",
@@ -130,44 +124,21 @@ def _extra(record: logging.LogRecord) -> dict[str, Any]:
     }
 
 
-class _PrivateRotatingFileHandler(RotatingFileHandler):
-    """A rotating log file that only the current user can read."""
-
-    def _open(self) -> TextIO:  # type: ignore[override]
-        return append_to_private_file(Path(self.baseFilename))
-
-
-def configure_logging(
-    settings: Settings, service: str, *, to_file: bool = True, for_operators: bool = True
-) -> None:
-    """Log to stderr and LOG_FILE in the format of LOG_FORMAT, with debug lines if DEBUG is set.
+def configure_logging(settings: Settings, service: str, *, for_operators: bool = True) -> None:
+    """Log to stderr in the format of LOG_FORMAT, with debug lines if DEBUG is set.
 
     Replaces the existing handlers of the root logger.
 
     Args:
-        to_file: Write to LOG_FILE. Commands that may run beside a server do not, because only one
-            process can rotate a file.
         for_operators: If False, a terminal shows no lines below WARNING, unless DEBUG is set.
-
-    Raises:
-        Misconfigured: `bad_setting`, if LOG_FILE can't be written.
     """
     stderr = logging.StreamHandler()
     if not for_operators and not settings.debug and stderr.stream.isatty():
         stderr.setLevel(logging.WARNING)
-    handlers: list[logging.Handler] = [stderr]
-    if to_file and settings.log_file is not None:
-        handlers.append(_open_log_file(settings.log_file))
-    for handler in handlers:
-        handler.addFilter(_ContextFilter(service))
-        handler.setFormatter(
-            _JsonFormatter() if settings.log_format == "json" else _TextFormatter()
-        )
+    stderr.addFilter(_ContextFilter(service))
+    stderr.setFormatter(_JsonFormatter() if settings.log_format == "json" else _TextFormatter())
     root = logging.getLogger()
-    for previous in root.handlers:
-        if isinstance(previous, _PrivateRotatingFileHandler):
-            previous.close()
-    root.handlers[:] = handlers
+    root.handlers[:] = [stderr]
     root.setLevel(logging.INFO)
     for name in OWN_LOGGERS:
         logging.getLogger(name).setLevel(logging.DEBUG if settings.debug else logging.INFO)
@@ -190,17 +161,7 @@ class _ForwardingHandler(logging.Handler):
 
 def forward_logs(settings: Settings, send: Callable[[logging.LogRecord], None]) -> None:
     """Pass the records of this process to `send`, picklable, and log nothing here."""
-    configure_logging(settings, "embedded", to_file=False)
+    configure_logging(settings, "embedded")
     handler = _ForwardingHandler(send)
     handler.addFilter(_ContextFilter("embedded"))
     logging.getLogger().handlers[:] = [handler]
-
-
-def _open_log_file(file: Path) -> logging.Handler:
-    try:
-        make_private_folder(file.parent)
-        return _PrivateRotatingFileHandler(
-            file, maxBytes=LOG_FILE_BYTES, backupCount=ROTATED_LOG_FILES, encoding="utf-8"
-        )
-    except OSError as error:
-        raise Misconfigured("bad_setting", f"LOG_FILE={file}: {error.strerror}") from None

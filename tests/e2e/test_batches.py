@@ -91,8 +91,7 @@ def test_index_takes_an_archive_as_it_takes_a_folder(server: ServerProcess, tmp_
     members |= {"trip/bad.jpg": b"no photo", "trip/notes.txt": b"of the trip"}
     path = tmp_path / "photos"  # its name says nothing
     path.write_bytes(zip_of({**members, "trip/photos.csv": table(first)}))
-    journal = ("--journal", str(tmp_path / "journal.jsonl"))
-    report = index(server, path, *journal, code=1)
+    report = index(server, path, code=1)
     assert (report["photos"], report["uploaded"], report["already_there"]) == (5, 4, 0)
     assert (report["other_files"], report["without_coordinates"]) == (1, 3)
     [refused] = report["refused"]
@@ -102,10 +101,9 @@ def test_index_takes_an_archive_as_it_takes_a_folder(server: ServerProcess, tmp_
     assert found["relative_path"] == f"trip/{first}.jpg"
     assert found["latitude"] == 45 + first / 1000
 
-    report = index(server, path, *journal, code=1)
+    report = index(server, path, code=1)
     assert (report["uploaded"], report["already_there"]) == (0, 4)
-    assert len(Path(journal[1]).read_text().splitlines()) == 5, "none was sent again"
-    assert sorted(each.name for each in tmp_path.iterdir()) == ["journal.jsonl", "photos"]
+    assert [each.name for each in tmp_path.iterdir()] == ["photos"]
 
 
 def test_index_takes_a_list_goes_on_after_a_break_and_names_what_failed(
@@ -118,20 +116,16 @@ def test_index_takes_a_list_goes_on_after_a_break_and_names_what_failed(
     names = ("170.jpg", "171.jpg", "bad.jpg")
     lines = [json.dumps({"filename": name, "place": "hall"}) for name in names]
     listed.write_text("\n".join(lines))
-    journal = tmp_path / "journal.jsonl"
-    options = ("--journal", str(journal))
-    report = index(server, listed, *options, code=1)
+    report = index(server, listed, code=1)
     assert report["uploaded"] == 2
     [refused] = report["refused"]
     assert refused["path"].endswith("bad.jpg")
     found = server.ask(photo_bytes(171), top_k=1).json()["similar_images"][0]
     assert found["place"] == "hall"
 
-    journal.write_text("".join(journal.read_text().splitlines(keepends=True)[:2]))
     listed.write_text("\n".join(lines[:2]))
-    report = index(server, listed, *options)
+    report = index(server, listed)
     assert (report["uploaded"], report["already_there"]) == (0, 2)
-    assert len(journal.read_text().splitlines()) == 3
 
 
 def test_index_brings_in_a_list_of_keys(server: ServerProcess, tmp_path: Path) -> None:
@@ -141,7 +135,7 @@ def test_index_brings_in_a_list_of_keys(server: ServerProcess, tmp_path: Path) -
     listed = tmp_path / "keys.jsonl"
     listed.write_text(json.dumps({"key": "imports/keys/180.jpg", "latitude": 45, "longitude": 7}))
     assert index(server, listed)["uploaded"] == 1
-    refused = index(server, listed, "--journal", str(tmp_path / "j.jsonl"), code=1)
+    refused = index(server, listed, "--update", code=1)
     assert refused["code"] == "unsupported_option"
 
 

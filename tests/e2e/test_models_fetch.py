@@ -28,7 +28,6 @@ def test_a_killed_fetch_goes_on_where_it_was(tmp_path: Path) -> None:
             tmp_path / "home",
             hf_endpoint=server.url,
             hf_home=tmp_path / "hf",
-            xdg_cache_home=tmp_path / "cache",
         )
         with (tmp_path / "fetch.log").open("wb") as log:
             fetching = start([PLACEWISE, *FETCH], env=env, cwd=tmp_path, stdout=log, stderr=log)

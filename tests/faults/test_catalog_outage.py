@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Iterator
@@ -18,7 +19,6 @@ from services.extractor.worker import ExtractorWorker
 from services.gateway.app import create_app
 from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
-from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
 from services.service_process import start_service_threads
 from services.steward.evaluation_worker import EvaluationWorker
@@ -29,6 +29,7 @@ from shared.catalog.database.session import Catalog, PoolConfig, TransactionTime
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map, get_or_create_default_map
 from shared.catalog.photos import Photo
+from shared.catalog.processes import process_heartbeat
 from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups
 from shared.search_api.protocol import SearchRequest
@@ -86,11 +87,12 @@ class Deployment:
             create_app(gateway), base_url="http://localhost", raise_server_exceptions=False
         )
         evaluator = EvaluationWorker(self.catalog, self.search, settings, "evaluator")
+        self._heartbeat = contextlib.ExitStack()
+        self._heartbeat.enter_context(process_heartbeat(self.catalog, "search", self.search.state))
         self._stop = threading.Event()
         self._parts = start_service_threads(
             {
                 "search": self.search.run,
-                "presence": WorkerHeartbeat(self.catalog, self.search, "search").run,
                 "extractor": partial(self._extractor.run, wait=wakeups.wait),
                 "steward": Scheduler(self.catalog, store, wakeups, settings).run,
                 "evaluator": evaluator.run,
@@ -143,6 +145,7 @@ class Deployment:
         self._stop.set()
         for part in self._parts:
             part.join()
+        self._heartbeat.close()
         self._extractor.close()
         self.catalog.close()
 

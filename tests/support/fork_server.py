@@ -31,7 +31,6 @@ from tools.make_api_page import openapi_description
 # imported by each process that needs it.
 MODULES = (
     "lab.cli.descriptors.describe_files",
-    "lab.cli.descriptors.fits",
     "services.extractor.service",
     "services.gateway.app",
     "services.search.service",

@@ -6,13 +6,11 @@ import json
 import logging
 import pickle
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 
 from shared.config.settings import Settings
-from shared.errors import Misconfigured
-from shared.telemetry.logs import LOG_FILE_BYTES, configure_logging, forward_logs
+from shared.telemetry.logs import configure_logging, forward_logs
 from shared.telemetry.tracing import request_id_context, request_id_or_new
 
 Set = Callable[..., None]
@@ -86,18 +84,16 @@ def test_text_lines_end_with_the_fields(set_up: Set, capsys: pytest.CaptureFixtu
 
 
 def test_a_terminal_of_the_embedded_server_shows_warnings_and_with_debug_all(
-    set_up: Set, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    set_up: Set, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     set_up()
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    log_file = tmp_path / "log"
-    configure_logging(Settings(log_file=log_file), "embedded", for_operators=False)
+    configure_logging(Settings(), "embedded", for_operators=False)
     log = logging.getLogger("services.request_log")
     log.info("POST /api/v1/upload: 202")
     log.warning("the disk is full")
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith("the disk is full")
-    assert "POST /api/v1/upload: 202" in log_file.read_text()
     configure_logging(Settings(debug=True), "embedded", for_operators=False)
     log.info("POST /api/v1/upload: 202")
     assert "POST /api/v1/upload: 202" in capsys.readouterr().err
@@ -137,34 +133,6 @@ def test_an_invalid_request_id_is_replaced(sent: str | None) -> None:
     assert made != sent
     assert len(made) == 36
     assert request_id_or_new("my-id:1/2") == "my-id:1/2"
-
-
-def test_a_log_file_gets_the_same_lines_is_rotated_and_private(
-    set_up: Set, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    file = tmp_path / "logs" / "gateway.log"
-    set_up(LOG_FILE=str(file), LOG_FORMAT="json")
-    for number in range(50):
-        logging.getLogger("services").info("line %d %s", number, "x" * (LOG_FILE_BYTES // 20))
-    files = sorted(path.name for path in file.parent.iterdir())
-    assert files == ["gateway.log", "gateway.log.1", "gateway.log.2"]
-    contents = [(file.parent / name).read_text() for name in reversed(files)]
-    assert capsys.readouterr().err.endswith("".join(contents))
-    assert all(len(text) <= LOG_FILE_BYTES for text in contents)
-    assert all(path.stat().st_mode & 0o077 == 0 for path in (file.parent, *file.parent.iterdir()))
-
-
-def test_a_log_file_that_cannot_be_written_is_a_bad_setting(set_up: Set, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(Misconfigured, match=r"LOG_FILE=.*Not a directory"):
-        set_up(LOG_FILE=str(tmp_path / "file" / "gateway.log"))
-
-
-def test_commands_beside_a_server_leave_its_log_file_alone(set_up: Set, tmp_path: Path) -> None:
-    set_up(LOG_FILE=str(tmp_path / "server.log"))
-    configure_logging(Settings(), "keys", to_file=False)
-    logging.getLogger("services").info("a key")
-    assert (tmp_path / "server.log").read_text() == ""
 
 
 @pytest.mark.parametrize("log_format", ["json", "text"])

@@ -50,15 +50,7 @@ def describe(
         typer.Option(
             exists=True,
             dir_okay=False,
-            help="VLAD vocabulary: .npz of `vocabulary fit`, .npy, or AnyLoc's c_centers.pt.",
-        ),
-    ] = None,
-    pca: Annotated[
-        Path | None,
-        typer.Option(
-            exists=True,
-            dir_okay=False,
-            help="PCA whitening to apply: .safetensors of `models fit-pca`.",
+            help="VLAD vocabulary: .npz of `vocabulary export`, .npy, or AnyLoc's c_centers.pt.",
         ),
     ] = None,
     root: Annotated[
@@ -104,7 +96,6 @@ def describe(
             out,
             config,
             vocabulary,
-            pca,
             settings,
             lambda n: progress.advance(bar, n),
             names=names,

@@ -15,7 +15,6 @@ from lab.evaluation.ranking import check_finite
 from services.cli.descriptors.load_extractor import load_extractor
 from services.cli.output import atomic_write, printable_path
 from shared.config.settings import Settings
-from shared.descriptors.pca_whitening import PcaProjection, decode_whitening
 from shared.extractor_config.configs import ExtractorConfig
 
 HLOC_DATASET = "global_descriptor"  # hloc's name of the dataset
@@ -54,7 +53,6 @@ def describe_files(
     out: Path,
     config: ExtractorConfig,
     vocabulary: Path | None,
-    pca: Path | None,
     settings: Settings,
     advance: Callable[[int], None],
     *,
@@ -66,7 +64,6 @@ def describe_files(
         photos: Photo files, in row order.
         out: Output file: `.npy`, or with `names`, one per photo, HDF5 in hloc's format.
         vocabulary: VLAD vocabulary; None for the shipped one.
-        pca: PCA whitening to apply, or None.
         settings: Device, precision, batch size and decoder limits.
         advance: Called with the number of photos of each finished batch.
 
@@ -76,21 +73,16 @@ def describe_files(
 
     Raises:
         Unprocessable: `photos_refused`, which lists every photo that can't be described with the
-            reason; `features_not_finite`; `vocabulary_unusable`; `pca_unusable`.
+            reason; `features_not_finite`; `vocabulary_unusable`.
         Misconfigured: `vocabulary_missing`, `out_unwritable`, and errors of loading the extractor.
     """
     started = time.perf_counter()
     own = load_own_vocabulary(config, vocabulary)
-    whitening = decode_whitening(pca.read_bytes()) if pca is not None else None
     extractor = load_extractor(config, settings)
     centres = resolve_centres(extractor, own)
-    projection = None
-    if whitening is not None:
-        whitening.check_compatible(extractor.spec(centres))
-        projection = PcaProjection(whitening.whitening, extractor.backbone.device)
     loaded = time.perf_counter()
-    shape = (len(photos), extractor.dimension(centres, projection))
-    describe = photo_describer(extractor, centres, settings, projection)
+    shape = (len(photos), extractor.dimension(centres))
+    describe = photo_describer(extractor, centres, settings)
     done = 0
     with atomic_write(out) as file, _open_descriptor_writer(file, shape, names) as write:
         for rows in describe(photos):
@@ -107,6 +99,6 @@ def describe_files(
         "file": printable_path(out),
         "rows": len(photos),
         "dimension": shape[1],
-        "spec": extractor.spec(centres, projection),
+        "spec": extractor.spec(centres),
         "seconds": {stage: round(duration, 3) for stage, duration in seconds.items()},
     }

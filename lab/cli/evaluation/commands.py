@@ -167,16 +167,6 @@ def evaluate(
             help="With --sequences: walk, bicycle, car, train, or a maximum speed in m/s."
         ),
     ] = "car",
-    kidnap_every: Annotated[
-        int | None,
-        typer.Option(
-            "--kidnap-every",
-            min=2,
-            metavar="FRAMES",
-            help="With --sequences: also carry the camera to another place after every so many "
-            "frames, and count the frames until it is relocalised.",
-        ),
-    ] = None,
     place_labels_are_paths: Annotated[
         bool,
         typer.Option(
@@ -207,7 +197,7 @@ def evaluate(
     file_options = lists | {"--ground-truth": ground_truth}
     output_options: OptionValues = {
         "--out": out, "--against": against, "--pairs": pairs, "--set": sets,
-        "--sequences": sequences, "--kidnap-every": kidnap_every, "--recall-at": recall_at,
+        "--sequences": sequences, "--recall-at": recall_at,
     }  # fmt: skip
     report_options = ReportOptions(
         out, against, pairs, depth, _parse_recall_at(recall_at, depth), grids, only_wrong,
@@ -258,7 +248,7 @@ def evaluate(
             }  # fmt: skip
             _reject_options("with --sequences", unused)
             speeds = parse_motion(motion)
-            evaluate_sequences(data, sets, protocol, rule, target, speeds, kidnap_every, as_json)
+            evaluate_sequences(data, sets, protocol, rule, target, speeds, as_json)
             return
         evaluate_sets(data, sets, protocol, rule, ground_truth, target, report_options)
         return
@@ -327,9 +317,7 @@ def compare(
     ] = None,
     protocol: ProtocolOption = None,
     rule: RuleOption = None,
-    out: Annotated[
-        Path | None, typer.Option(help="DIR: output folder for table.csv, table.tex and a figure.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="DIR: output folder for table.csv.")] = None,
     faiss_gpu: FaissGpuOption = False,
     extractor: Annotated[
         list[str] | None,

@@ -24,8 +24,7 @@ from lab.evaluation.exact_knn import exact_knn
 from lab.evaluation.paired_runs import PairedDifference, paired_differences
 from lab.evaluation.query_clusters import cluster_queries
 from lab.evaluation.ranking import DEFAULT_KS, Rows, describe_evaluation_set
-from lab.evaluation.report.charts import recall_comparison
-from lab.evaluation.report.tables import write_figures, write_tables
+from lab.evaluation.report.tables import write_table
 from lab.evaluation.results import package_versions
 from lab.evaluation.retrieval_metrics import RetrievalMetrics, compute_metrics
 from services.cli.environment import read_settings
@@ -224,10 +223,8 @@ def compare_extractors(
                 )
             compared.append(ComparedExtractor(entry.spec_text, measured, difference, **properties))
     if out is not None:
-        measured_by_name = [(each.name, each.measured) for each in compared]
         with refuse_unwritable(out):
-            write_tables(out, measured_by_name)
-            write_figures(out, evaluation_set.name, [recall_comparison(measured_by_name)])
+            write_table(out, [(each.name, each.measured) for each in compared])
     if as_json:
         print_json(_comparison_as_json(evaluation_set, compared))
     else:

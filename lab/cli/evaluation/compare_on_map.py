@@ -21,7 +21,7 @@ from sqlalchemy import select
 from lab.cli.descriptors.extractors import photo_decoder, photo_describer
 from lab.evaluation.ranking import check_finite
 from services.cli.descriptors.load_extractor import load_extractor
-from services.cli.descriptors.local_weights import has_local_weights, list_extractor_configs
+from services.cli.descriptors.local_weights import inspect_weights, list_extractor_configs
 from services.cli.environment import read_settings
 from services.cli.output import (
     Table,
@@ -133,7 +133,7 @@ class MapComparison:
         configs = list_extractor_configs(settings)
         self.at_hand = [
             generation.extractor,
-            *(config.name for config in configs if has_local_weights(config, settings)),
+            *(config.name for config in configs if inspect_weights(config, settings).available),
             *((model.config or {}).get("extractor", model.name) for model in added),
         ]
         self.described: dict[str, Described] = {}

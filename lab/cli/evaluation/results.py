@@ -10,7 +10,6 @@ import numpy as np
 from rich.table import Column
 
 from lab.cli.evaluation.commands import ReportOptions
-from lab.datasets.check import SuspectLabel, find_suspect_labels
 from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.datasets.ground_truth_files import read_ground_truth, read_integer_lists
 from lab.datasets.photo_lists import read_photo_list
@@ -71,11 +70,10 @@ def evaluate_rankings(
     """
     queries, database = evaluation_set.queries, evaluation_set.database
     scores = ranked.scores if has_scores else None
-    clusters, metres, suspects = singleton_clusters(len(queries)), None, list[SuspectLabel]()
+    clusters, metres = singleton_clusters(len(queries)), None
     if database:
         clusters = cluster_queries(queries)
         metres = match_distances(queries, database, ranked.indices)
-        suspects = find_suspect_labels(evaluation_set, ranked.indices, scores)
     measured = compute_metrics(
         ranked.indices,
         evaluation_set.positives,
@@ -87,9 +85,7 @@ def evaluate_rankings(
     against = None
     if options.against is not None:
         against = compare_with_run(options.against, evaluation_set, measured)
-    return EvaluationResult(
-        evaluation_set, ranked, has_scores, measured, about, against, tuple(suspects), places
-    )
+    return EvaluationResult(evaluation_set, ranked, has_scores, measured, about, against, places)
 
 
 def output_results(

@@ -1,4 +1,4 @@
-"""`placewise evaluate --data DIR --sequences`: single frames, SeqSLAM and tracks. Imports torch."""
+"""`placewise evaluate --data DIR --sequences`: single frames and tracks. Imports torch."""
 
 from __future__ import annotations
 
@@ -16,11 +16,8 @@ from lab.datasets.open_dataset import evaluation_set_names, open_evaluation_set
 from lab.evaluation.ranking import describe_evaluation_set
 from lab.evaluation.sequences import (
     FrameResult,
-    evaluate_kidnapped,
     evaluate_sequence,
-    kidnapping_figures,
     prepare_map,
-    resample,
     sequence_figures,
     split_sequences,
 )
@@ -40,11 +37,9 @@ from shared.tracks.motion import MotionModel
 
 METHODS = {
     "single": "single frames",
-    "seqslam": "SeqSLAM, constant velocity",
     "filter": "filter",
     "smoothed": "filter, forward and backward",
 }
-RESAMPLED = ("filter", "tracking", "right among them", "ECE")
 
 
 def evaluate_sequences(
@@ -54,12 +49,9 @@ def evaluate_sequences(
     rule: str | None,
     target: EvaluationTarget,
     motion: MotionModel,
-    kidnap_every: int | None,
     as_json: bool,
 ) -> None:
     """Evaluate tracks on the sets below `data` that have sequences.
-
-    With `kidnap_every`, the camera is also carried away after every so many frames.
 
     Raises NotFound (`no_evaluation_set`, `no_sequences`), InvalidRequest (`options_contradict`,
     `no_model`), and errors of opening the sets.
@@ -74,9 +66,7 @@ def evaluate_sequences(
         for name in names or evaluation_set_names(data):
             evaluation_set = open_evaluation_set(data, name, protocol=protocol, rule=rule)
             if split_sequences(evaluation_set.queries):
-                figures[name] = _evaluate_set(
-                    evaluation_set, target, motion, kidnap_every, progress
-                )
+                figures[name] = _evaluate_set(evaluation_set, target, motion, progress)
     if not figures:
         raise NotFound(
             "no_sequences",
@@ -94,7 +84,6 @@ def _evaluate_set(
     evaluation_set: EvaluationSet,
     target: EvaluationTarget,
     motion: MotionModel,
-    kidnap_every: int | None,
     progress: Progress,
 ) -> Json:
     describer = make_describer(evaluation_set, target, read_settings(), progress)
@@ -104,28 +93,12 @@ def _evaluate_set(
     map_ = prepare_map(evaluation_set, database, motion)
     sequences: list[list[FrameResult]] = []
     milliseconds: list[float] = []
-    again: dict[str, list[list[FrameResult]]] = {}
-    found: list[int | None] = []
     members_of = split_sequences(evaluation_set.queries)
-    # Along a map with coordinates the pace is not learned.
-    rides = [
-        {"": members} | ({} if map_.has_coordinates else resample(members))
-        for members in members_of
-    ]
-    total, done = sum(map(len, rides)), 0
-    for ride in rides:
-        for title, frames in ride.items():
-            followed, seconds = evaluate_sequence(
-                map_, evaluation_set, frames, queries[frames], motion
-            )
-            (again.setdefault(title, []) if title else sequences).append(followed)
-            milliseconds.append(1000 * seconds)
-            on_progress("tracking", done := done + 1, total)
-        if kidnap_every is not None:
-            members = ride[""]
-            found += evaluate_kidnapped(
-                map_, evaluation_set, members, queries[members], motion, kidnap_every
-            )
+    for done, members in enumerate(members_of, start=1):
+        frames, seconds = evaluate_sequence(map_, evaluation_set, members, queries[members], motion)
+        sequences.append(frames)
+        milliseconds.append(1000 * seconds)
+        on_progress("tracking", done, len(members_of))
     by_sequence = {
         str(evaluation_set.queries[members[0]].sequence): sequence_figures([frames])
         for members, frames in zip(members_of, sequences, strict=True)
@@ -135,8 +108,6 @@ def _evaluate_set(
         "database": len(database),
         "filter_ms_a_frame": statistics.fmean(milliseconds),
         **sequence_figures(sequences),
-        "resampled": {title: sequence_figures(frames) for title, frames in again.items()},
-        **({} if kidnap_every is None else kidnapping_figures(found)),
         "sequences": by_sequence,
     }
 
@@ -160,13 +131,6 @@ def _print_figures(name: str, figures: Json) -> None:
         precise = figures["recall_at_99_precision"].get(key)
         table.add_row(title, format_percent(figures["recall"][key]), format_percent(precise))
     print_table(table)
-    if figures["resampled"]:
-        table = Table("the ride again", *(Column(title, justify="right") for title in RESAMPLED))
-        for title, again in figures["resampled"].items():
-            recall, precision = again["recall"]["filter"], again["tracking_precision"]
-            shares = (recall, again["tracking"], precision)
-            table.add_row(title, *map(format_percent, shares), f"{again['calibration_error']:.3f}")
-        print_table(table)
     rows = {
         "frames in the map with the status tracking": format_percent(figures["tracking"]),
         "right among them": format_percent(figures["tracking_precision"]),
@@ -175,12 +139,6 @@ def _print_figures(name: str, figures: Json) -> None:
         "frames to notice that the map was left": _frame_counts(figures["frames_to_notice_lost"]),
         "frames outside with the status tracking": format_percent(figures["claimed_outside"]),
     }
-    if "kidnapped" in figures:
-        rows |= {
-            "carried to another place": f"{figures['kidnapped']} times",
-            "relocalised within 40 frames": format_percent(figures["found_within_40_frames"]),
-            "frames until relocalised": _frame_counts(figures["frames_until_found"]),
-        }
     table = Table("tracking", Column("value", justify="right"))
     for title, value in rows.items():
         table.add_row(title, value)

@@ -14,8 +14,6 @@ from rich.table import Column
 from lab.cli.training.options import given_options, with_training_options
 from lab.training.arguments import (
     build_arguments,
-    combine_obstacles,
-    find_early_obstacles,
     load_yaml,
 )
 from services.cli.environment import require_packages
@@ -135,9 +133,7 @@ def train(
         )
     layers = [load_yaml(config)] if config is not None else []
     if resume is None:
-        obstacles = find_early_obstacles(build_arguments(*layers, overrides))
-        if obstacles:
-            raise combine_obstacles(obstacles)
+        trained = build_arguments(*layers, overrides)
 
     # PyTorch and Lightning take half a minute to import from a cold disk.
     from lab.training import run
@@ -149,7 +145,7 @@ def train(
             if resume is not None:
                 report = run.resume(resume, overrides, display, stop)
             else:
-                report = run.run(build_arguments(*layers, overrides), display, stop)
+                report = run.run(trained, display, stop)
         except RunStopped as stopped:
             print_note(str(stopped))
             raise typer.Exit(EXIT_INTERRUPTED) from stopped

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lab.datasets.dataset import DatasetPhoto
 from lab.evaluation.results import EvaluationResult
-from lab.evaluation.retrieval_metrics import RetrievalMetrics, distance_error
+from lab.evaluation.retrieval_metrics import distance_error
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,13 +26,6 @@ if TYPE_CHECKING:
 
 # From the palette of Okabe and Ito, which is distinguishable with any colour vision.
 BLUE, RED, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#c4c4c4"
-
-
-class Chart(Markup):
-    """An `<img>` element, and the figure that it shows."""
-
-    figure: Figure
-    caption: str
 
 
 def percent_chart(
@@ -61,7 +54,7 @@ def percent_chart(
     return figure, axes
 
 
-def render_chart(figure: Figure, title: str) -> Chart:
+def render_chart(figure: Figure, title: str) -> Markup:
     """Render a chart as an `<img>` element; the title is its alternative text."""
     from matplotlib import rc_context
 
@@ -69,13 +62,10 @@ def render_chart(figure: Figure, title: str) -> Chart:
     with rc_context({"svg.hashsalt": title, "svg.fonttype": "none"}):
         figure.savefig(svg, format="svg", metadata={"Creator": None, "Date": None})
     encoded = base64.b64encode(svg.getvalue().encode()).decode()
-    image = Markup('<img src="data:image/svg+xml;base64,{}" alt="{}">').format(encoded, title)
-    chart = Chart(image)
-    chart.figure, chart.caption = figure, title
-    return chart
+    return Markup('<img src="data:image/svg+xml;base64,{}" alt="{}">').format(encoded, title)
 
 
-def recall_chart(result: EvaluationResult) -> Chart:
+def recall_chart(result: EvaluationResult) -> Markup:
     """Render recall@k over k."""
     curve = np.asarray(result.measured.recall_curve)
     ks = np.arange(1, len(curve) + 1)
@@ -93,18 +83,7 @@ def recall_chart(result: EvaluationResult) -> Chart:
     return render_chart(figure, "Recall@k")
 
 
-def recall_comparison(measured: Sequence[tuple[str, RetrievalMetrics]]) -> Chart:
-    """Render recall@k over k, a line for each name."""
-    depth = len(measured[0][1].recall_curve)
-    ticks = [k for k in (1, 5, 10, 20) if k <= depth]
-    figure, axes = percent_chart("k: number of retrieved photos", "recall@k", x_ticks=ticks)
-    for name, each in measured:
-        axes.plot(range(1, depth + 1), each.recall_curve, ".-", label=name)
-    axes.legend(fontsize="small")
-    return render_chart(figure, "Recall@k")
-
-
-def precision_chart(result: EvaluationResult) -> Chart | None:
+def precision_chart(result: EvaluationResult) -> Markup | None:
     """Render the precision-recall curve; None without scores."""
     curve = result.measured.curve
     if curve is None:
@@ -115,7 +94,7 @@ def precision_chart(result: EvaluationResult) -> Chart | None:
     return render_chart(figure, "Precision and recall of the first match")
 
 
-def reliability_chart(levels: Sequence[dict[str, Any]]) -> Chart:
+def reliability_chart(levels: Sequence[dict[str, Any]]) -> Markup:
     """Render the observed share of right answers over the stated probability, a line a level.
 
     `levels` are the figures of each level (`reliability_figures`), finest first.
@@ -134,7 +113,7 @@ def reliability_chart(levels: Sequence[dict[str, Any]]) -> Chart:
     return render_chart(figure, "Reliability of the probabilities of levels")
 
 
-def distance_chart(result: EvaluationResult) -> Chart | None:
+def distance_chart(result: EvaluationResult) -> Markup | None:
     """Render the cumulative distance error of first matches; None without positions."""
     metres = result.measured.metres
     error = None if metres is None else distance_error(metres[:, 0])
@@ -158,7 +137,7 @@ MAX_DATABASE_POINTS = 4000
 MAX_QUERY_POINTS = 2000
 
 
-def positions_chart(result: EvaluationResult) -> tuple[Chart, str] | None:
+def positions_chart(result: EvaluationResult) -> tuple[Markup, str] | None:
     """Render a map of queries and first matches, and its caption; None without positions."""
     zone = _most_common_zone(result.evaluation_set.queries)
     database = _utm_positions(result.evaluation_set.database, zone)

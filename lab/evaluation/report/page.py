@@ -20,7 +20,7 @@ from lab.evaluation.report.charts import (
     reliability_chart,
 )
 from lab.evaluation.report.retrieval_grids import changed_grids, retrieval_grids
-from lab.evaluation.report.tables import write_figures, write_tables
+from lab.evaluation.report.tables import write_table
 from lab.evaluation.results import EvaluationResult, EvaluationRun, package_versions
 from shared.evaluation.bootstrap import ConfidenceInterval
 
@@ -32,7 +32,7 @@ def write_report(
     grids_shown: int,
     only_wrong: bool,
 ) -> None:
-    """Write the report of a run, `report.html`, its tables, and its charts as figures.
+    """Write the report of a run, `report.html`, and its table.
 
     Args:
         grids_shown: maximum number of queries per retrieval grid.
@@ -48,9 +48,7 @@ def write_report(
             "changed_grids": changed_grids(result, grids_shown),
             "grids": retrieval_grids(result, grids_shown, only_wrong=only_wrong),
         })  # fmt: skip
-        drawn = (*charts, levels or None, positions and positions[0])
-        write_figures(out, result.evaluation_set.name, drawn)
-    write_tables(out, [(each.evaluation_set.name, each.measured) for each in results])
+    write_table(out, [(each.evaluation_set.name, each.measured) for each in results])
     page = _templates.get_template("evaluation.html").render(
         title=f"Evaluation of {run.name}",
         about={"model": run.name, "fingerprint": run.fingerprint or "unknown", **run.about},

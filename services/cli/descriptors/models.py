@@ -6,7 +6,7 @@ of `placewise train` and exported networks on a server.
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -15,22 +15,14 @@ from rich.markup import escape
 from rich.table import Column
 
 from services.cli.client import connect, wait_for_job
-from services.cli.descriptors.local_weights import (
-    WeightsRecord,
-    inspect_weights,
-    list_extractor_configs,
-    save_record,
-)
-from services.cli.environment import import_lab, read_settings
+from services.cli.descriptors.local_weights import inspect_weights, list_extractor_configs
+from services.cli.environment import read_settings
 from services.cli.output import (
     JsonOption,
     KeyOption,
     MapOption,
     ServerOption,
     Table,
-    err_console,
-    format_pca,
-    print_failures,
     print_json,
     print_message,
     print_result,
@@ -38,11 +30,11 @@ from services.cli.output import (
     progress_bar,
 )
 from shared.errors import Misconfigured
-from shared.extractor_config.configs import MAX_PCA_DIMENSION, get_extractor_config
+from shared.extractor_config.configs import get_extractor_config
 
 EXPORTED_NETWORK = {"backbone_arch": "exported", "agg_arch": ""}  # nothing else is known of it
 
-app = typer.Typer(help="Manage extractor weights, trained models and PCA files.")
+app = typer.Typer(help="Manage extractor weights and trained models.")
 
 
 @app.command("add")
@@ -151,27 +143,14 @@ def remove(
 
 @app.command("list")
 def list_(as_json: JsonOption = False) -> None:
-    """List extractors and their weights on this machine.
-
-    The first listing reads each weights file to compute its fingerprint.
-    """
+    """List extractors and their weights on this machine."""
     settings = read_settings()
-    with err_console.status("Searching for weights") as status:
-
-        def reading(path: Path) -> None:
-            status.update(f"Computing the fingerprint of {path}")
-
-        all_weights = [
-            inspect_weights(config, settings, reading)
-            for config in list_extractor_configs(settings)
-        ]
+    all_weights = [inspect_weights(config, settings) for config in list_extractor_configs(settings)]
     if as_json:
         print_json([asdict(weights) for weights in all_weights])
         return
     name = Column("extractor", overflow="fold", min_width=23)
-    table = Table(
-        name, "available", "size", Column("source", overflow="fold"), "licence", "fingerprint"
-    )
+    table = Table(name, "available", "size", Column("source", overflow="fold"), "licence")
     for weights in all_weights:
         table.add_row(
             escape(weights.extractor),
@@ -179,7 +158,6 @@ def list_(as_json: JsonOption = False) -> None:
             _format_megabytes(weights.size_bytes),
             escape(weights.source),
             escape(weights.licence),
-            (weights.fingerprint or "")[:12],
         )
     print_table(table)
 
@@ -208,7 +186,6 @@ def fetch(
         )
     from shared.descriptors.backbones import backbone_class  # imports torch
 
-    dimension = config.dimension
     with progress_bar() as progress:
         bar = progress.add_task(f"{escape(config.name)} (bytes)", visible=False)
 
@@ -216,11 +193,11 @@ def fetch(
             progress.update(bar, completed=done, total=total, visible=True)
 
         loaded = backbone_class(config).fetch(config, settings.dino_weights, on_progress)
+    weights = inspect_weights(config, settings)
+    dimension = config.dimension
     if loaded is not None:
         dimension = loaded.width
-        found = loaded.find_weights(config, settings.dino_weights)
-        save_record(found.key, WeightsRecord(loaded.fingerprint, loaded.card["size_bytes"]))
-    weights = inspect_weights(config, settings)
+        weights = replace(weights, size_bytes=loaded.card["size_bytes"])
     if not weights.available:
         raise Misconfigured("weights_unusable", weights.note or "")
     if as_json:
@@ -229,42 +206,9 @@ def fetch(
     size_text = _format_megabytes(weights.size_bytes)
     print_message(f"{weights.extractor}: {dimension} dimensions, {size_text} of weights.")
     print_message(f"Source: {weights.source}. Path: {weights.path}.")
-    print_message(f"Licence: {weights.licence}. Fingerprint: {weights.fingerprint}.")
+    print_message(f"Licence: {weights.licence}.")
     if config.hub is not None and config.name not in settings.allowed_hub_extractors:
         print_message(f"To allow maps to use it, set CODE_ALLOWED={config.name}")
-
-
-@app.command("fit-pca")
-def fit_pca(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            metavar="ROWS.npy|DIR",
-            exists=True,
-            help="Rows written by `describe`, or photos below a folder.",
-        ),
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE.safetensors", help="Output file.")],
-    dimension: Annotated[
-        int, typer.Option(min=1, max=MAX_PCA_DIMENSION, help="Number of dimensions to keep.")
-    ] = 512,
-    extractor: Annotated[
-        str | None, typer.Option(help="With DIR: extractor name. Default: the setting EXTRACTOR.")
-    ] = None,
-    vocabulary: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="With DIR: VLAD vocabulary.")
-    ] = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Fit a PCA whitening without a server and write it to a file for `describe --pca`."""
-    fits = import_lab("lab.cli.descriptors.fits", "`models fit-pca`")
-    with progress_bar() as progress:
-        fitted = fits.fit_pca_locally(
-            source, out, dimension, extractor=extractor, vocabulary=vocabulary, progress=progress
-        )
-    if not as_json:
-        print_failures(fitted, "refused")
-    print_result(fitted, as_json, f"{fitted['file']}: {format_pca(fitted)}.")
 
 
 def _format_megabytes(size_bytes: int | None) -> str:

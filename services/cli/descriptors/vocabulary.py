@@ -12,7 +12,6 @@ from rich.table import Column
 
 from placewise.answers import Generation, Job
 from services.cli.client import active_generation, connect, wait_for_job
-from services.cli.environment import import_lab
 from services.cli.output import (
     Json,
     JsonOption,
@@ -21,7 +20,6 @@ from services.cli.output import (
     ServerOption,
     Table,
     atomic_write,
-    print_failures,
     print_json,
     print_result,
     print_table,
@@ -36,21 +34,6 @@ app = typer.Typer(help="Manage VLAD vocabularies (cluster centres): fit, import,
 
 @app.command("fit")
 def fit(
-    folder: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[DIR]",
-            exists=True,
-            file_okay=False,
-            help="Fit on photos below this folder, without a server. Default: the map's photos.",
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE.npz", help="With DIR: output file.")
-    ] = None,
-    extractor: Annotated[
-        str | None, typer.Option(help="With DIR: extractor name. Default: the setting EXTRACTOR.")
-    ] = None,
     clusters: Annotated[
         int | None,
         typer.Option(
@@ -69,37 +52,7 @@ def fit(
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Fit a vocabulary on the map's photos, reindex them, and switch to the result.
-
-    With DIR, fit on a folder and write the vocabulary to a file for `import`.
-    """
-    if folder is not None:
-        # --server and --key are not rejected: the environment may set them for all commands.
-        _reject_options("a map", {"--map": map_name})
-        if out is None:
-            raise InvalidRequest("bad_out", "Specify the output file: --out FILE.npz")
-        fits = import_lab("lab.cli.descriptors.fits", "`vocabulary fit DIR`")
-        with progress_bar() as progress:
-            fitted = fits.fit_vocabulary_on_folder(
-                folder,
-                out,
-                extractor=extractor,
-                clusters=clusters,
-                sample=sample,
-                seed=seed,
-                progress=progress,
-            )
-        if not as_json:
-            print_failures(fitted, "refused")
-        photos, cosine = (fitted["provenance"][name] for name in ("photos", "mean_cosine"))
-        print_result(
-            fitted,
-            as_json,
-            f"{fitted['file']}: {fitted['clusters']} clusters of {fitted['dimension']} dimensions "
-            f"from {photos} photos, mean cosine {cosine:.4f}.",
-        )
-        return
-    _reject_options("a folder (vocabulary fit DIR)", {"--out": out, "--extractor": extractor})
+    """Fit a vocabulary on the map's photos, reindex them, and switch to the result."""
     options = {"clusters": clusters, "sample": sample, "seed": seed}
     parameters = {name: value for name, value in options.items() if value is not None}
     with connect(server, map_name, key) as client, progress_bar() as progress:
@@ -114,7 +67,7 @@ def import_(
         typer.Argument(
             exists=True,
             dir_okay=False,
-            help=".npz of `vocabulary fit DIR`, .npy, or AnyLoc's c_centers.pt",
+            help=".npz of `vocabulary export`, .npy, or AnyLoc's c_centers.pt",
         ),
     ],
     map_name: MapOption = None,
@@ -214,14 +167,6 @@ def _format_pca(generation: Generation | None) -> str:
     if generation is None or generation.pca_from is None:
         return ""
     return f"\nPCA: {generation.dimension} of {generation.pca_from} dimensions"
-
-
-def _reject_options(source: str, options: dict[str, object]) -> None:
-    """Raise InvalidRequest (`options_contradict`) if one of the options is given."""
-    if invalid := [name for name, value in options.items() if value is not None]:
-        raise InvalidRequest(
-            "options_contradict", f"{', '.join(invalid)} requires a fit on {source}."
-        )
 
 
 def _print_generation(job: Job, as_json: bool) -> None:

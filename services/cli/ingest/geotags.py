@@ -60,11 +60,6 @@ class LocalPhoto:
     sidecars: Mapping[str, bytes] = field(default_factory=dict)
     """XMP by path"""
 
-    @property
-    def file(self) -> Path:
-        """The file with its bytes: the photo itself, or its archive."""
-        return self.path if self.archived is None else self.archived.archive.path
-
     def open(self) -> BinaryIO:
         """Open the photo. Raises OSError, and what `ArchivedFile.read` raises."""
         if self.archived is None:

@@ -16,7 +16,6 @@ from placewise.answers import BatchStarted
 from placewise.client import Client
 from placewise.protocol import open_file
 from services.cli.client import client_command, connect, describe_target
-from services.cli.environment import read_settings
 from services.cli.ingest.anyloc import read_anyloc_photos
 from services.cli.ingest.geotags import (
     LocalPhoto,
@@ -36,7 +35,6 @@ from services.cli.ingest.upload import (
     upload_photos,
     wait_for_batch,
 )
-from services.cli.ingest.upload_journal import UploadJournal
 from services.cli.output import (
     Json,
     JsonOption,
@@ -103,14 +101,6 @@ def index(
         typer.Option(help="`query` uploads labelled queries for `placewise evaluate`."),
     ] = PhotoRole.DATABASE,
     update: UpdateOption = False,
-    journal: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Record uploaded photos in FILE; a later run with the same FILE skips them. Only "
-            "for photos of this machine.",
-        ),
-    ] = None,
     no_fit: NoFitOption = False,
     map_name: MapOption = None,
     server: ServerOption = None,
@@ -135,7 +125,6 @@ def index(
         **folder_options,
         "--anyloc": anyloc,
         "--update": update,
-        "--journal": journal,
     }
     source, path = sources[0], Path(sources[0])
     photos: list[LocalPhoto] = []
@@ -205,10 +194,7 @@ def index(
         if batch is not None:
             report = wait_for_batch(client, batch(client), progress)
         else:
-            # An embedded server has another port each time: PLACEWISE_HOME identifies it instead.
-            url = server or str(read_settings().placewise_home.resolve())
-            used = stack.enter_context(UploadJournal(journal, url, map_name)) if journal else None
-            report = upload_photos(client, photos, progress, update=update, journal=used)
+            report = upload_photos(client, photos, progress, update=update)
     report |= about_sources
     if as_json:
         print_json(report)

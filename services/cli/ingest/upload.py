@@ -25,7 +25,6 @@ from placewise.client import Client
 from placewise.protocol import printable_name
 from services.cli.client import wait_for_job
 from services.cli.ingest.geotags import LocalPhoto
-from services.cli.ingest.upload_journal import UploadJournal
 from services.cli.output import Json, print_note, utf8_path
 from shared.errors import Conflict, NotFound, PlacewiseError, Unprocessable
 from shared.ingest.photo_metadata import KEY_FIELD
@@ -62,14 +61,13 @@ def upload_photos(
     progress: Progress,
     *,
     update: bool = False,
-    journal: UploadJournal | None = None,
 ) -> Json:
     """Upload photos, and wait until they are described and an automatic vocabulary fit has ended.
 
     The operation is idempotent: a photo that is already stored is not described again.
 
     With `update`, the metadata of stored photos that differ is changed; otherwise such photos are
-    refused. Uploads that the journal records are skipped, and new ones are recorded.
+    refused.
 
     Returns:
         Counts (`photos`, `uploaded`, `already_there`, `updated`, and `searchable` in the whole
@@ -93,24 +91,13 @@ def upload_photos(
 
     reported_codes: set[str] = set()
     retrying_client = client.with_patience(RETRY_PERIOD_SECONDS, show_wait)
-    remaining = []
-    for photo in photos:
-        line = None if journal is None else journal.done(photo)
-        if line is None:
-            remaining.append(photo)
-        elif line["job_id"] is not None:
-            pending.append((photo, line["job_id"]))
-    counts["already_there"] = len(photos) - len(remaining)
-    progress.update(uploading, completed=counts["already_there"])
-    for photo, outcome in _upload_concurrently(retrying_client, remaining, update):
+    for photo, outcome in _upload_concurrently(retrying_client, photos, update):
         progress.update(uploading, advance=1, description="uploading")
         if isinstance(outcome, PlacewiseError):
             refused.append(_photo_failure(photo, outcome.detail))
             continue
         counts["already_there" if outcome.already_there else "uploaded"] += 1
         counts["updated"] += bool(outcome.updated)
-        if journal is not None:
-            journal.add(photo, outcome)
         if outcome.job_id is not None and outcome.status not in FINISHED:
             pending.append((photo, outcome.job_id))
     describing = progress.add_task("describing", total=len(pending))
@@ -226,7 +213,7 @@ def _wait_for_jobs(
     for photo, job_id in pending:
         try:
             job = wait_until_described(client, job_id)
-        except NotFound:  # recorded in the journal and deleted since
+        except NotFound:  # the photo was deleted meanwhile
             progress.advance(bar)
             continue
         if not job.finished:

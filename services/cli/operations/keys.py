@@ -42,9 +42,6 @@ def create(
     requests_per_minute: Annotated[
         int | None, typer.Option(min=1, max=10**9, help="Rate limit.")
     ] = None,
-    upload_bytes_per_day: Annotated[
-        int | None, typer.Option(min=1, max=2**53, help="Upload quota.")
-    ] = None,
     max_photos: Annotated[
         int | None, typer.Option(min=1, max=2**53, help="Maximum number of stored photos.")
     ] = None,
@@ -58,7 +55,6 @@ def create(
     """
     limits = {
         "requests_per_minute": requests_per_minute,
-        "upload_bytes_per_day": upload_bytes_per_day,
         "max_photos": max_photos,
     }
     with connect(server, None, key) as client:

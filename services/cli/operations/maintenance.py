@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 def migrate_catalog(settings: Settings) -> UUID:
     """Create the catalog's tables; return the id of the installation."""
-    configure_logging(settings, "migrate", to_file=False)
+    configure_logging(settings, "migrate")
     with contextlib.closing(open_catalog(settings, "migrate")) as catalog:
         migrate(catalog)
         with catalog.write() as session:

@@ -35,7 +35,7 @@ from shared.catalog.jobs import Job, JobKind, Priority
 from shared.catalog.maps import DEFAULT_MAP, CachedMapStatistics, Map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
-from shared.catalog.processes import RegisteredProcess, RegisteredSearchWorker
+from shared.catalog.processes import RegisteredProcess
 from shared.config.settings import Settings
 from shared.errors import Conflict
 from shared.ids import new_id
@@ -44,10 +44,7 @@ from shared.storage import ObjectStore, OwnedStore
 # Tables that may have rows after a first start.
 TABLES_WITH_INITIAL_ROWS = {
     table.__tablename__
-    for table in (
-        *(ApiKey, Installation, Map, CachedMapStatistics, Model),
-        *(RegisteredProcess, RegisteredSearchWorker),
-    )
+    for table in (ApiKey, Installation, Map, CachedMapStatistics, Model, RegisteredProcess)
 }
 
 
@@ -64,7 +61,7 @@ def begin_rebuild(catalog: Catalog, store: OwnedStore, installation_id: UUID | N
         installation = get_or_create_installation(session)
         if installation.journal_sequence != REBUILDING:
             _check_empty(session)
-            for table in (RegisteredSearchWorker, CachedMapStatistics, Map):
+            for table in (CachedMapStatistics, Map):
                 session.execute(delete(table))
             installation.journal_sequence = REBUILDING
         if installation_id is not None:

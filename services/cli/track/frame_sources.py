@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import math
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
 
 from PIL import Image
 
@@ -22,14 +19,6 @@ UNKNOWN_BEGIN = datetime.fromtimestamp(0, UTC)  # the time of a file is that of 
 MIN_STEP = timedelta(milliseconds=1)  # between photos whose clocks show the same time
 ROUNDING_SECONDS = 1e-6
 JPEG_QUALITY = 92  # of the frames of a video
-NO_TIMESTAMPS = 0x80  # FFmpeg's AVFMT_NOTIMESTAMPS: a raw stream, such as .h264
-COUNTERCLOCKWISE = (
-    None,
-    Image.Transpose.ROTATE_90,
-    Image.Transpose.ROTATE_180,
-    Image.Transpose.ROTATE_270,
-)
-"""Of an image, by quarter turns"""
 
 
 class Order(StrEnum):
@@ -97,7 +86,7 @@ def read_photo_frames(folder: Path, timing: FrameTiming) -> list[SourceFrame]:
 def read_video_frames(video: Path, timing: FrameTiming, folder: Path) -> Iterator[SourceFrame]:
     """Decode a frame of a video every `timing.every_seconds` and write it to a folder as JPEG.
 
-    Frames are turned as players turn them. Those of a raw stream have times by its frame rate.
+    Frames are turned as players turn them.
 
     Raises:
         Misconfigured: `no_video_decoder`.
@@ -122,60 +111,29 @@ def read_video_frames(video: Path, timing: FrameTiming, folder: Path) -> Iterato
             recorded = _parse_created(container.metadata.get("creation_time"))
             first = timing.begin or recorded or UNKNOWN_BEGIN
             _print_clock(timing.begin, recorded, "the video")
-            tagged = container.streams.video[0].metadata.get("rotate", "0")
+            begin = None
             due = 0.0
-            for seconds, frame in _with_seconds(container):
+            for frame in container.decode(video=0):
+                if frame.time is None:
+                    raise InvalidRequest(
+                        "unreadable_video",
+                        f"{printable_path(video)} does not say when its frames were taken. "
+                        f"Give it times: ffmpeg -framerate 30 -i {video.name} -c copy ride.mp4",
+                    )
+                begin = frame.time if begin is None else begin
+                seconds = frame.time - begin
                 if seconds < due - ROUNDING_SECONDS:
                     continue
                 steps = 1 + (seconds - due + ROUNDING_SECONDS) // timing.every_seconds
                 due += timing.every_seconds * steps
                 path = folder / f"frame-{seconds:010.3f}.jpg"
-                _upright(frame, tagged).save(path, quality=JPEG_QUALITY)
+                image = Image.fromarray(frame.to_ndarray(format="rgb24"))
+                image.rotate(frame.rotation, expand=True).save(path, quality=JPEG_QUALITY)
                 yield SourceFrame(path, path.name, first + timedelta(seconds=seconds))
     except av.FFmpegError as error:
         raise InvalidRequest(
             "unreadable_video", f"Can't read the video {printable_path(video)}: {error}"
         ) from error
-
-
-def _with_seconds(container: Any) -> Iterator[tuple[float, Any]]:
-    """Yield the frames of a video with their times after the first one.
-
-    A frame without a time follows the one before after a frame's duration.
-    """
-    stream = container.streams.video[0]
-    rate = float(stream.codec_context.framerate or stream.guessed_rate or 25)  # FFmpeg's default
-    is_raw = bool(container.format.flags & NO_TIMESTAMPS)
-    if is_raw:
-        print_note(f"The video has no times: {rate:g} frames a second are assumed.")
-    begin = None
-    seconds = -1 / rate
-    for frame in container.decode(stream):
-        time = None if is_raw else frame.time
-        begin = time if begin is None else begin
-        seconds = seconds + 1 / rate if time is None or begin is None else time - begin
-        yield seconds, frame
-
-
-def _upright(frame: Any, tagged: str) -> Image.Image:
-    """Return a frame as players show it.
-
-    Args:
-        frame: A frame with a display matrix (x' = a x + c y, y' = b x + d y) or without.
-        tagged: Degrees clockwise by which older files without one say that it is to be turned.
-    """
-    image = Image.fromarray(frame.to_ndarray(format="rgb24"))
-    matrix = next((each for each in frame.side_data if each.type.name == "DISPLAYMATRIX"), None)
-    if matrix is None:
-        quarters = -round(float(tagged) / 90) if tagged.lstrip("-").isdigit() else 0
-    else:
-        a, b, _, c, d = struct.unpack_from("<5i", bytes(matrix))
-        if a * d < b * c:
-            image = image.transpose(Image.Transpose.FLIP_LEFT_RIGHT)
-            a, b = -a, -b
-        quarters = round(math.atan2(-b, a) / (math.pi / 2))
-    turn = COUNTERCLOCKWISE[quarters % 4]
-    return image if turn is None else image.transpose(turn)
 
 
 def _with_distinct_times(frames: list[SourceFrame]) -> list[SourceFrame]:

@@ -1,10 +1,9 @@
-"""Files of a track: CSV, GPX and GeoJSON, by the extension of their names."""
+"""Files of a track: CSV and GPX, by the extension of their names."""
 
 from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Callable, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from placewise.answers import OneTrack, TrackFrame, TrackState
-from services.cli.output import Json, atomic_write, check_output_path, printable_path
+from services.cli.output import atomic_write, check_output_path, printable_path
 from shared.errors import InvalidRequest
 from shared.ingest.photo_metadata import escape_csv_text
 
@@ -105,41 +104,7 @@ def _to_gpx(track: OneTrack) -> bytes:
     return bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))
 
 
-def _to_geojson(track: OneTrack) -> bytes:
-    """A line for each part that is not lost, and a point for each frame."""
-    features: list[Json] = [
-        _feature(
-            "LineString",
-            [[state.longitude, state.latitude] for _, state in segment],
-            {"kind": "track", "track_id": str(track.track_id)},
-        )
-        for segment in located_segments(track)
-        if len(segment) > 1
-    ]
-    for frame in track.frames:
-        row = track_row(frame)
-        position = [row["longitude"], row["latitude"]]
-        properties = {name: _plain(value) for name, value in row.items()}
-        features.append(
-            _feature(
-                "Point", None if None in position else position, {"kind": "frame", **properties}
-            )
-        )
-    collection = {"type": "FeatureCollection", "features": features}
-    return json.dumps(collection, ensure_ascii=False, indent=1).encode()
-
-
-def _feature(kind: str, coordinates: list[Any] | None, properties: Json) -> Json:
-    geometry = None if coordinates is None else {"type": kind, "coordinates": coordinates}
-    return {"type": "Feature", "geometry": geometry, "properties": properties}
-
-
-def _plain(value: Any) -> Any:
-    return value if isinstance(value, (int, float)) or value is None else str(value)
-
-
 WRITERS: dict[str, Callable[[OneTrack], bytes]] = {
     ".csv": _to_csv,
     ".gpx": _to_gpx,
-    ".geojson": _to_geojson,
 }

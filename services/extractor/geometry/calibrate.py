@@ -30,7 +30,7 @@ from shared.geometry.radius import (
     normal_radii,
 )
 from shared.matching.features import WORKING_SIDE, LocalFeatures
-from shared.matching.matchers import Matcher
+from shared.matching.matchers import MutualNearest
 
 CANDIDATES = 10
 NEIGHBOUR_SECONDS = 2.0
@@ -110,7 +110,7 @@ class ComponentPhotos:
 
 def localise_left_out(
     photos: ComponentPhotos,
-    matcher: Matcher,
+    matcher: MutualNearest,
     on_progress: Callable[[int], None],
     threads: int = min(os.cpu_count() or 1, 4),
     *,
@@ -287,7 +287,7 @@ def _quantile(ratios: Floats, level: float, normal: float) -> float:
 
 
 def calibrate_components(
-    parts: Sequence[ComponentPhotos], matcher: Matcher, on_progress: Callable[[float], None]
+    parts: Sequence[ComponentPhotos], matcher: MutualNearest, on_progress: Callable[[float], None]
 ) -> list[PoseCalibration]:
     """Calibrate the poses in each component, of queries by other lenses and by those of the map.
 

@@ -9,19 +9,17 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.extractor.geometry.matching import VerifiedMatches
+from services.extractor.geometry.pycolmap_models import PhotoToMap
 from shared.errors import Unprocessable
 from shared.geometry.cameras import Floats
 from shared.geometry.frames import GPS_SIGMA_M, UNKNOWN_ALTITUDE_SIGMA_M, Similarity, fit_similarity
-
-if TYPE_CHECKING:
-    from services.extractor.geometry.mapping import PhotoToMap
 
 NEAR_M = 3 * GPS_SIGMA_M
 """Coordinates that are so near each other contradict no match"""

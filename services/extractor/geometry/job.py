@@ -12,7 +12,6 @@ from __future__ import annotations
 import hashlib
 import sys
 import threading
-from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -34,15 +33,11 @@ from services.extractor.geometry.calibrate import (
     propose_coordinates,
 )
 from services.extractor.geometry.evidence import explain_left_out
-from services.extractor.geometry.mapping import (
-    MappedComponent,
-    PhotoToMap,
-    import_model,
-    map_photos,
-    require_pycolmap,
-)
+from services.extractor.geometry.imported_models import import_model, match_names
+from services.extractor.geometry.mapping import MappedComponent, map_photos
 from services.extractor.geometry.matching import VerifiedMatches, match_pairs
 from services.extractor.geometry.pairs import choose_pairs
+from services.extractor.geometry.pycolmap_models import PhotoToMap, require_pycolmap
 from services.extractor.handlers import ExtractorContext
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.base import db_now
@@ -228,7 +223,7 @@ class ReconstructionJob:
             check=self._progress.check,
         )
         if known is not None:
-            matches = _join_matches(matches, known)
+            matches = matches.joined(known)
         self._store.put(key, matches.encode())
         with self._catalog.write() as session:
             self._end_step(session)
@@ -558,53 +553,3 @@ def _left_out_result(
         "left_out": len(listed),
         "left_out_photos": listed[:MAX_NAMES_REPORTED],
     }
-
-
-def _join_matches(new: VerifiedMatches, known: VerifiedMatches) -> VerifiedMatches:
-    """Return the matches of both; photos of `known` that are gone have none."""
-    numbers = {id_: number for number, id_ in enumerate(new.photo_ids)}
-    known_pairs = [
-        (pair, keypoints)
-        for row, keypoints in zip(known.pairs.tolist(), known.keypoints, strict=True)
-        if (pair := [numbers.get(known.photo_ids[number], -1) for number in row]) and min(pair) >= 0
-    ]
-    pairs = np.array([*new.pairs.tolist(), *(pair for pair, _ in known_pairs)], np.int32)
-    return replace(
-        new,
-        pairs=pairs.reshape(-1, 2),
-        keypoints=(*new.keypoints, *(keypoints for _, keypoints in known_pairs)),
-    )
-
-
-def match_names(names: Sequence[str], paths: Mapping[UUID, str]) -> dict[str, UUID]:
-    """Return the photos of the image names of a model, as far as exactly one has each name.
-
-    A name is that of a photo if one of both paths ends with the other: `day 1/a.jpg` is `a.jpg` and
-    `walk/day 1/a.jpg`. Of several such photos it is the one with the same path.
-
-    Args:
-        names: Of the images.
-        paths: Relative path, or else file name, by photo.
-    """
-    by_file_name = defaultdict[str, list[UUID]](list)
-    for id_, path in paths.items():
-        by_file_name[path.rpartition("/")[2]].append(id_)
-    found: dict[str, UUID] = {}
-    for name in names:
-        parts = _path_parts(name)
-        fitting = []
-        for id_ in by_file_name[parts[0]]:
-            others = _path_parts(paths[id_])
-            common = min(len(parts), len(others))
-            if parts[:common] == others[:common]:
-                fitting.append(id_)
-        same = [id_ for id_ in fitting if _path_parts(paths[id_]) == parts]
-        if len(fitting) == 1 or len(same) == 1:
-            found[name] = (same or fitting)[0]
-    times = Counter(found.values())
-    return {name: id_ for name, id_ in found.items() if times[id_] == 1}
-
-
-def _path_parts(path: str) -> list[str]:
-    """Return the parts of a path from its end."""
-    return path.replace("\\", "/").split("/")[::-1]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from services.extractor.geometry.pairs import Pairs
 from shared.geometry.component import UNREADABLE
 from shared.matching.features import LocalFeatures
-from shared.matching.matchers import Matcher
+from shared.matching.matchers import MutualNearest
 from shared.matching.verification import verify_matches
 
 MIN_INLIERS = 15
@@ -39,6 +39,18 @@ class VerifiedMatches:
         """Return the matches of the chosen pairs (m,)."""
         keypoints = tuple(self.keypoints[n] for n in np.flatnonzero(chosen).tolist())
         return VerifiedMatches(self.photo_ids, self.pairs[chosen], keypoints)
+
+    def joined(self, other: VerifiedMatches) -> VerifiedMatches:
+        """Return the matches of both, those of `other` as far as its photos are among these."""
+        numbers = {id_: number for number, id_ in enumerate(self.photo_ids)}
+        known = np.array([numbers.get(id_, -1) for id_ in other.photo_ids], np.int32)
+        pairs = known[other.pairs]
+        is_here = pairs.min(axis=1, initial=0) >= 0
+        return VerifiedMatches(
+            self.photo_ids,
+            np.concatenate([self.pairs, pairs[is_here]]),
+            (*self.keypoints, *other.only(is_here).keypoints),
+        )
 
     def encode(self) -> bytes:
         """Encode as a compressed npz."""
@@ -75,7 +87,7 @@ class VerifiedMatches:
 def match_pairs(
     photos: Mapping[UUID, LocalFeatures],
     pairs: Pairs,
-    matcher: Matcher,
+    matcher: MutualNearest,
     on_progress: Callable[[int], None],
     threads: int = min(os.cpu_count() or 1, 4),
 ) -> VerifiedMatches:

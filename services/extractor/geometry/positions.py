@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from uuid import UUID
 
 import numpy as np
@@ -18,12 +18,10 @@ from services.extractor.geometry.evidence import (
 )
 from services.extractor.geometry.lookalikes import find_lookalikes
 from services.extractor.geometry.matching import VerifiedMatches
+from services.extractor.geometry.pycolmap_models import PhotoToMap
 from shared.geometry.cameras import Floats
 from shared.geometry.component import Component
 from shared.geometry.frames import UNKNOWN_ALTITUDE_SIGMA_M
-
-if TYPE_CHECKING:
-    from services.extractor.geometry.mapping import PhotoToMap
 
 MIN_PRIOR_SIGMA_M = 0.02
 """Least standard deviation of coordinates: that of a survey"""

@@ -180,7 +180,7 @@ def _queue_batch(
     idempotent: IdempotentRequest,
 ) -> BatchAcceptedResponse:
     try:
-        idempotent.claim_key(received.idempotency_content())
+        idempotent.begin(received.idempotency_content())
         rows, source, params = _plan_items(gateway, received)
         with gateway.catalog.write() as session:
             map_id = get_map(session, map_name).id

@@ -13,7 +13,6 @@ from services.gateway.admission import ADMIT_JOB
 from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import GatewayDep, MapQuery, PageQuery
 from services.gateway.idempotency import IdempotentDep
-from services.gateway.json_bodies import JsonRoute
 from services.gateway.responses import JobAcceptedResponse
 from shared.catalog.chunks import has_geotagged
 from shared.catalog.generations import (
@@ -30,7 +29,7 @@ from shared.jobs import Job, JobKind, Priority
 from shared.responses import ResponseModel
 from shared.responses.maps import EvaluationResponse
 
-router = APIRouter(tags=["evaluations"], route_class=JsonRoute)
+router = APIRouter(tags=["evaluations"])
 
 
 class EvaluationRequest(RequestModel):

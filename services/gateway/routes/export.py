@@ -15,30 +15,23 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
-from typing import IO, Annotated, Any
+from typing import IO, Any
 
 import numpy as np
-from fastapi import APIRouter, Query
+from fastapi import APIRouter
 from fastapi.responses import StreamingResponse
-from pydantic import Field
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from services.gateway.authentication import READ
-from services.gateway.dependencies import GatewayDep, GenerationId, MapParams
-from shared.catalog.chunks import Chunk, Descriptor, find_features_model, list_live_chunks
+from services.gateway.dependencies import GatewayDep, GenerationId, MapQuery
+from shared.catalog.chunks import Descriptor, list_live_chunks
 from shared.catalog.generations import Generation, get_generation
 from shared.catalog.maps import get_map
 from shared.catalog.photos import Photo
-from shared.errors import NotFound
 from shared.ingest.photo_metadata import escape_csv_text
 from shared.storage import ObjectStore
-from shared.storage.chunks import features_key, read_chunk
-from shared.storage.feature_files import (
-    encode_feature_index,
-    read_feature_index,
-    read_feature_rows,
-)
+from shared.storage.chunks import read_chunk
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +39,6 @@ router = APIRouter(tags=["models"])
 
 SPOOL_BYTES = 8 * 1024 * 1024  # larger tables are spooled to a temporary file
 STREAM_READ_BYTES = 256 * 1024
-FEATURE_ROWS_READ = 64  # about 4 MB
 PHOTO_COLUMNS = (
     Photo.filename,
     Photo.latitude,
@@ -62,18 +54,9 @@ CSV_HEADER = ("row", "image_id", *(column.key for column in PHOTO_COLUMNS))
 TAR_RESPONSE: dict[int | str, dict[str, Any]] = {
     200: {
         "content": {"application/x-tar": {"schema": {"type": "string", "format": "binary"}}},
-        "description": "A tar with `photos.csv`, `names.txt` and `descriptors.npy`, and with "
-        "`features` also `local.features`.",
+        "description": "A tar with `photos.csv`, `names.txt` and `descriptors.npy`.",
     }
 }
-
-
-class ExportParams(MapParams):
-    """Query parameters of the export."""
-
-    features: bool = Field(
-        False, description="Also export the local features of the photos, `local.features`."
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +66,6 @@ class _ChunkRows:
     object_key: str
     sha256: str
     rows: list[int]
-    feature_sizes: list[int]
-    """Bytes of the local features of each row; 0 without."""
 
 
 @router.get(
@@ -95,28 +76,23 @@ class _ChunkRows:
     responses=TAR_RESPONSE,
 )
 def export_descriptors(
-    gateway: GatewayDep, generation_id: GenerationId, query: Annotated[ExportParams, Query()]
+    gateway: GatewayDep, generation_id: GenerationId, query: MapQuery
 ) -> StreamingResponse:
     """Download the descriptors of all live photos as a tar archive.
 
     `descriptors.npy` has the shape (photos, dimension) and the type float32, with L2-normalised
-    rows; `photos.csv` and `names.txt` are in the same order, and so is `local.features`.
+    rows; `photos.csv` and `names.txt` are in the same order.
     """
     with contextlib.ExitStack() as files, gateway.catalog.read() as session:
         generation = get_generation(session, get_map(session, query.map).id, generation_id)
         table = files.enter_context(tempfile.SpooledTemporaryFile(SPOOL_BYTES))
         names = files.enter_context(tempfile.SpooledTemporaryFile(SPOOL_BYTES))
-        model = find_features_model(session, generation.id) if query.features else None
-        chunks = _write_tables(session, gateway.store, generation, table, names, model)
+        chunks = _write_tables(session, generation, table, names)
         header = _npy_header(sum(len(chunk.rows) for chunk in chunks), generation.dimension)
         files = files.pop_all()  # closed by `stream`
     rows = sum(len(chunk.rows) for chunk in chunks)
     size = len(header) + rows * generation.dimension * np.dtype(np.float32).itemsize
     members = [("photos.csv", table.tell()), ("names.txt", names.tell()), ("descriptors.npy", size)]
-    sizes = [size_bytes for chunk in chunks for size_bytes in chunk.feature_sizes]
-    index = encode_feature_index(model or "none", sizes, "local.features")
-    if query.features:
-        members.append(("local.features", len(index) + sum(sizes)))
 
     def stream() -> Iterator[bytes]:
         with files:
@@ -124,9 +100,8 @@ def export_descriptors(
                 _read_blocks(table),
                 _read_blocks(names),
                 _stream_rows(gateway.store, header, chunks),
-                _stream_features(gateway.store, index, chunks),
             )
-            for (name, size_bytes), content in zip(members, contents, strict=False):
+            for (name, size_bytes), content in zip(members, contents, strict=True):
                 entry = tarfile.TarInfo(name)
                 entry.size, entry.mtime = size_bytes, int(generation.created_at.timestamp())
                 yield entry.tobuf(tarfile.GNU_FORMAT)
@@ -147,17 +122,9 @@ def export_descriptors(
 
 
 def _write_tables(
-    session: Session,
-    store: ObjectStore,
-    generation: Generation,
-    table: IO[bytes],
-    names: IO[bytes],
-    features_model: str | None,
+    session: Session, generation: Generation, table: IO[bytes], names: IO[bytes]
 ) -> list[_ChunkRows]:
-    """Write photos.csv to `table` and names.txt to `names`; return the rows to export.
-
-    Local features are exported with them, if they are of the model `features_model`.
-    """
+    """Write photos.csv to `table` and names.txt to `names`; return the rows to export."""
     chunks: list[_ChunkRows] = []
     number = 0
     for chunk in list_live_chunks(session, generation.id):
@@ -178,8 +145,7 @@ def _write_tables(
             number += 1
         table.write(lines.getvalue().encode())
         rows = [row[0] for row in photo_rows]
-        sizes = _feature_sizes(store, chunk, features_model, rows)
-        chunks.append(_ChunkRows(chunk.object_key, chunk.sha256, rows, sizes))
+        chunks.append(_ChunkRows(chunk.object_key, chunk.sha256, rows))
     if not chunks:
         table.write(",".join(CSV_HEADER).encode() + b"\r\n")
     return chunks
@@ -205,33 +171,6 @@ def _stream_rows(store: ObjectStore, header: bytes, chunks: list[_ChunkRows]) ->
             rows = read_chunk(store, chunk.object_key, chunk.sha256)
             for row in chunk.rows:
                 yield rows[row].astype(np.float32).tobytes()
-
-
-def _feature_sizes(
-    store: ObjectStore, chunk: Chunk, model: str | None, rows: list[int]
-) -> list[int]:
-    """Return the bytes of the local features of each row; 0 where there are none of this model."""
-    if model is not None and chunk.features_model == model:
-        key = features_key(chunk.object_key)
-        try:
-            sizes: list[int] = np.diff(read_feature_index(store, key).offsets)[rows].tolist()
-            return sizes
-        except (NotFound, ValueError) as error:
-            log.error("the local features %s can't be read: %s", key, error)
-    return len(rows) * [0]
-
-
-def _stream_features(store: ObjectStore, index: bytes, chunks: list[_ChunkRows]) -> Iterator[bytes]:
-    yield index
-    for chunk in chunks:
-        rows = [row for row, size in zip(chunk.rows, chunk.feature_sizes, strict=True) if size]
-        if rows:
-            key = features_key(chunk.object_key)
-            file = read_feature_index(store, key)
-            for begin in range(0, len(rows), FEATURE_ROWS_READ):
-                some = rows[begin : begin + FEATURE_ROWS_READ]
-                found = read_feature_rows(store, key, file, some)
-                yield from (found[row] for row in some)
 
 
 def _read_blocks(file: IO[bytes]) -> Iterator[bytes]:

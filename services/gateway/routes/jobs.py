@@ -24,6 +24,7 @@ from services.gateway.dependencies import (
     MapPageParams,
     MapParams,
     MapQuery,
+    find_job,
     load_job_of_map,
     wait_for_job,
 )
@@ -178,9 +179,10 @@ async def _events(
             return
         while True:
             try:
-                change = await gateway.job_notifier.wait_for_change(
+                state = await gateway.job_notifier.wait_for_change(
                     job_id, last_seen, HEARTBEAT_SECONDS
                 )
+                row = await run_in_threadpool(find_job, gateway, job_id)
                 break
             except TimeoutError:
                 yield ": heartbeat\n\n"
@@ -189,6 +191,6 @@ async def _events(
                     raise
                 yield ": the catalog is unreachable\n\n"
                 await asyncio.sleep(CATALOG_RETRY_SECONDS)
-        if change is None:
+        if state is None or row is None:
             return
-        job, last_seen = JobResponse.of(change.job, map_name, job.filename), change.state
+        job, last_seen = JobResponse.of(row, map_name, job.filename), state

@@ -9,14 +9,13 @@ from pydantic import Field
 
 from services.gateway.authentication import ADMIN
 from services.gateway.dependencies import NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep, KeyId
-from services.gateway.json_bodies import JsonRoute
 from shared.catalog.api_keys import KeyLimits, create_api_key, list_api_keys, revoke_api_key
 from shared.catalog.maps import MAP_NAME_PATTERN
 from shared.http.request_model import RequestModel
 from shared.responses.maps import CreatedKeyResponse, KeyResponse
 from shared.security.api_keys import Scope
 
-router = APIRouter(tags=["administration"], dependencies=[NO_PARAMETERS], route_class=JsonRoute)
+router = APIRouter(tags=["administration"], dependencies=[NO_PARAMETERS])
 
 DAY_SECONDS = 86_400
 MAX_KEY_DAYS = 36_500
@@ -45,7 +44,6 @@ class CreateKeyRequest(RequestModel):
         description="days until it expires; null: never",
     )
     requests_per_minute: Annotated[int | None, Field(ge=1, le=10**9)] = None
-    upload_bytes_per_day: KeyLimit = None
     max_photos: KeyLimit = None
 
 
@@ -63,7 +61,7 @@ def create_key(gateway: GatewayDep, body: CreateKeyRequest) -> CreatedKeyRespons
     Therefore this endpoint does not support `Idempotency-Key`: if the response is lost, revoke the
     key and create another one.
     """
-    limits = KeyLimits(body.requests_per_minute, body.upload_bytes_per_day, body.max_photos)
+    limits = KeyLimits(body.requests_per_minute, body.max_photos)
     life_seconds = None if body.days is None else body.days * DAY_SECONDS
     with gateway.catalog.write() as session:
         api_key, secret = create_api_key(

@@ -9,7 +9,6 @@ from services.gateway.admission import ADMIT_JOB
 from services.gateway.authentication import WRITE
 from services.gateway.dependencies import GatewayDep, MapQuery
 from services.gateway.idempotency import IdempotentDep
-from services.gateway.json_bodies import JsonRoute
 from services.gateway.responses import JobAcceptedResponse
 from shared.catalog.jobs import UNFINISHED_STATES, list_jobs
 from shared.catalog.maps import get_map, lock_map
@@ -18,7 +17,7 @@ from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
 from shared.jobs.transitions import requeue_job_as_new
 
-router = APIRouter(tags=["model changes"], route_class=JsonRoute)
+router = APIRouter(tags=["model changes"])
 
 
 class LibrarySyncRequest(RequestModel):

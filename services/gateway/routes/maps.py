@@ -12,7 +12,6 @@ from sqlalchemy.orm import Session
 from services.gateway.authentication import READ, WRITE, get_caller
 from services.gateway.dependencies import ALL_MAPS, NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep
 from services.gateway.idempotency import IdempotentDep
-from services.gateway.json_bodies import JsonRoute
 from shared.catalog.chunks import count_features, find_features_model
 from shared.catalog.generations import Generation, RowType, active_generation
 from shared.catalog.jobs import UNFINISHED_STATES, list_jobs
@@ -51,7 +50,7 @@ from shared.responses.maps import (
     Measurement,
 )
 
-router = APIRouter(tags=["maps"], dependencies=[NO_PARAMETERS], route_class=JsonRoute)
+router = APIRouter(tags=["maps"], dependencies=[NO_PARAMETERS])
 
 MapNamePath = Annotated[
     str, Path(description="the map's name", min_length=1, max_length=100, pattern=NO_NUL_PATTERN)

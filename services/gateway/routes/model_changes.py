@@ -14,7 +14,6 @@ from services.gateway.admission import ADMIT_JOB, AdmissionDep, UploadKind
 from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import NO_NUL_PATTERN, GatewayContext, GatewayDep, MapQuery
 from services.gateway.idempotency import IdempotentDep, IdempotentFormDep, IdempotentRequest
-from services.gateway.json_bodies import JsonRoute
 from services.gateway.responses import JobAcceptedResponse
 from services.gateway.uploads.multipart import FormFile, multipart_schema, receive_form_file
 from shared.catalog.chunks import estimate_described
@@ -39,7 +38,7 @@ from shared.responses.maps import GenerationResponse, VocabularyResponse
 from shared.storage.keys import new_vocabulary_key
 from shared.storage.vocabulary_npz import encode_vocabulary_file
 
-router = APIRouter(tags=["model changes"], route_class=JsonRoute)
+router = APIRouter(tags=["model changes"])
 
 MAX_VOCABULARY_BYTES = 64_000_000
 
@@ -143,7 +142,7 @@ def _queue_import(
 ) -> JobAcceptedResponse:
     upload = file.complete()
     params = {"object_key": upload.key, "filename": upload.filename}
-    with idempotent.claim_form(upload), gateway.catalog.write() as session:
+    with idempotent.begin_form(upload), gateway.catalog.write() as session:
         map_id = get_map(session, map_name).id
         job = start_model_change(session, map_id, JobKind.IMPORT, params)
         accepted = idempotent.accept_job(session, job)

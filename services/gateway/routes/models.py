@@ -24,7 +24,6 @@ from services.gateway.dependencies import (
     MapQuery,
 )
 from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
-from services.gateway.json_bodies import JsonRoute
 from services.gateway.responses import JobAcceptedResponse
 from services.gateway.uploads.multipart import FormFile, multipart_schema, receive_form_file
 from shared.catalog.maps import get_map
@@ -73,7 +72,7 @@ MODEL_FORM_FIELDS: dict[str, dict[str, Any]] = {
     "note": {"type": "string", "maxLength": MAX_NOTE_CHARACTERS, "description": "free text"},
 }
 
-router = APIRouter(tags=["models"], route_class=JsonRoute)
+router = APIRouter(tags=["models"])
 
 ModelNamePath = Annotated[
     str, Path(description="the model's name", min_length=1, max_length=100, pattern=NO_NUL_PATTERN)
@@ -136,7 +135,7 @@ def _queue_model(
     gateway: GatewayContext, map_name: str, file: FormFile, idempotent: IdempotentRequest
 ) -> JobAcceptedResponse:
     upload = file.complete()
-    with idempotent.claim_form(upload), gateway.catalog.write() as session:
+    with idempotent.begin_form(upload), gateway.catalog.write() as session:
         job = Job(
             id=new_id(),
             map_id=get_map(session, map_name).id,

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from datetime import datetime
 from functools import partial
-from typing import Annotated, Any, BinaryIO, Literal
+from typing import Annotated, Any, BinaryIO
 from urllib.parse import quote
 from uuid import UUID
 
@@ -26,16 +26,10 @@ from services.gateway.dependencies import (
     GatewayDep,
     MapParams,
     MapQuery,
-    PageParams,
     invalid_cursor_error,
 )
-from services.gateway.json_bodies import JsonRoute
-from services.gateway.photo_search import MAX_COUNTED_MATCHES, MetadataFilter, search_photos
+from services.gateway.photo_search import MAX_COUNTED_MATCHES, MetadataSearchParams, search_photos
 from services.gateway.responses import JobAcceptedResponse, MetadataSearchResponse, photo_response
-from services.gateway.similarity.search_params import (
-    FilterParams,
-    parse_optional_time,
-)
 from shared.catalog.chunks import find_descriptor
 from shared.catalog.generations import active_generation
 from shared.catalog.jobs import UNFINISHED_STATES
@@ -47,7 +41,7 @@ from shared.catalog.photos import (
     get_photo,
     mark_photo_deleted,
 )
-from shared.errors import Conflict, NotFound, invalid_field_error
+from shared.errors import Conflict, NotFound
 from shared.http.request_model import RequestModel
 from shared.imaging.capture_place import MAX_ALTITUDE_M
 from shared.imaging.file_formats import needs_preview
@@ -69,7 +63,7 @@ from shared.responses.jobs import DeletedPhotoResponse
 from shared.responses.similarity import PhotoDetailResponse, PhotoResponse
 from shared.storage.keys import preview_key, thumbnail_key
 
-router = APIRouter(tags=["photos"], route_class=JsonRoute)
+router = APIRouter(tags=["photos"])
 
 STREAM_READ_BYTES = 256 * 1024
 IMAGE_RESPONSE: dict[int | str, dict[str, Any]] = {
@@ -357,64 +351,17 @@ def _queue_again(session: Session, photo: Photo) -> Job:
     return job
 
 
-class MetadataSearchParams(FilterParams, PageParams):
-    filename: str | None = Field(
-        None,
-        max_length=1000,
-        description="part of the file name or of `relative_path`, case-insensitive",
-    )
-    upload_after: str | None = Field(None, description="ISO 8601; no offset means UTC")
-    upload_before: str | None = Field(None, description="ISO 8601; no offset means UTC")
-    min_file_size: int | None = Field(None, ge=0, le=2**62)
-    max_file_size: int | None = Field(None, ge=0, le=2**62)
-    role: PhotoRole | None = Field(None, description="photos with this role; omitted: all")
-    failed: bool = Field(
-        False, description="photos that can't be searched for, because their description failed"
-    )
-    without_place: bool = Field(
-        False, description="photos that have neither coordinates nor a place label"
-    )
-    place_given: bool = Field(
-        False, description="photos whose place was given with `POST /places`, and not undone"
-    )
-    removed: bool = Field(False, description="photos in the trash, instead of those of the map")
-    sort: Literal["added", "taken"] = Field(
-        "added", description="newest first; `taken`: only photos whose time is known"
-    )
-    limit: int = Field(100, ge=1, le=1000)
-
-    def metadata_filter(self) -> MetadataFilter:
-        """Parse the conditions; 422 (`invalid_field`) names the invalid parameter."""
-        if self.filename is not None and "\0" in self.filename:
-            raise invalid_field_error("filename", "contains a NUL character")
-        return MetadataFilter(
-            filename=self.filename,
-            upload_after=parse_optional_time("upload_after", self.upload_after),
-            upload_before=parse_optional_time("upload_before", self.upload_before),
-            min_file_size=self.min_file_size,
-            max_file_size=self.max_file_size,
-            photos=self.photo_filter(),
-            role=self.role,
-            failed=self.failed,
-            without_place=self.without_place,
-            place_given=self.place_given,
-            removed=self.removed,
-            by_capture=self.sort == "taken",
-        )
-
-
 @router.get("/search", operation_id="search_metadata", dependencies=[READ])
 def search_photos_by_metadata(
     gateway: GatewayDep, query: Annotated[MetadataSearchParams, Query()]
 ) -> MetadataSearchResponse:
     """Search photos by their metadata, newest first, with a cursor (of the same `sort`)."""
     started = time.perf_counter()
-    metadata_filter = query.metadata_filter()
     after = _decode_cursor(query.cursor) if query.cursor else None
     with gateway.catalog.read() as session:
         map_id = get_map(session, query.map).id
-        matches, total = search_photos(session, map_id, metadata_filter, query.limit + 1, after)
-    page, next_cursor = query.split(matches, partial(_encode_cursor, metadata_filter))
+        matches, total = search_photos(session, map_id, query, query.limit + 1, after)
+    page, next_cursor = query.split(matches, partial(_encode_cursor, query))
     return MetadataSearchResponse(
         total_found=total,
         total_is_exact=total < MAX_COUNTED_MATCHES,
@@ -436,8 +383,8 @@ def _read_blocks(file: BinaryIO) -> Iterator[bytes]:
             yield block
 
 
-def _encode_cursor(metadata_filter: MetadataFilter, last: Photo) -> str:
-    time = last.captured_at if metadata_filter.by_capture else last.uploaded_at
+def _encode_cursor(query: MetadataSearchParams, last: Photo) -> str:
+    time = last.captured_at if query.sort == "taken" else last.uploaded_at
     assert time is not None
     return base64.urlsafe_b64encode(f"{time.isoformat()} {last.id}".encode()).decode()
 

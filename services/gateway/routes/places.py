@@ -17,7 +17,6 @@ from services.gateway.given_places import (
     propose_places,
     undo_places,
 )
-from services.gateway.json_bodies import JsonRoute
 from services.gateway.routes.positions import ProposalOptions
 from shared.catalog.database.base import count_rows, list_newest
 from shared.catalog.maps import get_map
@@ -30,7 +29,7 @@ from shared.responses.reconstructions import (
     UndonePlacesResponse,
 )
 
-router = APIRouter(tags=["photos"], route_class=JsonRoute)
+router = APIRouter(tags=["photos"])
 
 PROPOSALS_PATH = "/places/proposals"
 MAX_GIVEN = 1000

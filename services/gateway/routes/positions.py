@@ -13,7 +13,6 @@ from pydantic import AwareDatetime, ConfigDict, Field, model_validator
 
 from services.gateway.authentication import READ
 from services.gateway.dependencies import NO_PARAMETERS, GatewayDep, MapQuery
-from services.gateway.json_bodies import JsonRoute
 from shared.catalog.chunks import count_searchable
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
@@ -37,7 +36,7 @@ from shared.responses import ResponseModel
 from shared.responses.reconstructions import PhotoHeaderResponse, ProposalResponse
 from shared.tracks.motion import motion_model
 
-router = APIRouter(tags=["photos"], route_class=JsonRoute)
+router = APIRouter(tags=["photos"])
 
 MAX_NAME = 1000
 MAX_UNLOCATED = 100

@@ -38,7 +38,6 @@ from services.gateway.dependencies import (
     UploadId,
 )
 from services.gateway.idempotency import IdempotentDep, IdempotentReplay, delete_if_refused
-from services.gateway.json_bodies import JsonRoute
 from services.gateway.responses import accepted_headers, url_in_map
 from services.gateway.routes.photos import PhotoUpdate
 from services.gateway.routes.uploads import (
@@ -48,7 +47,6 @@ from services.gateway.routes.uploads import (
     wait_for_description,
 )
 from shared.catalog.database.base import db_now_plus
-from shared.catalog.idempotency import StoredResponse
 from shared.catalog.maps import get_map
 from shared.catalog.photos import PresignedUpload, get_presigned_upload
 from shared.errors import Conflict, NotFound, Unavailable, Unprocessable
@@ -67,7 +65,7 @@ from shared.responses.jobs import UploadResponse
 from shared.storage import ObjectInfo, PresigningStore
 from shared.storage.keys import incoming_key, new_original_key
 
-router = APIRouter(tags=["photos"], route_class=JsonRoute)
+router = APIRouter(tags=["photos"])
 
 PRESIGN_SECONDS = 900  # to send and complete an upload: 100 MB at 1 Mbit/s
 FILE_FIELDS = ("filename", "file_size", "sha256")
@@ -103,7 +101,6 @@ class PresignResponse(ResponseModel):
     dependencies=[WRITE, CHECK_PHOTO_QUOTA, ADMIT_JOB],
 )
 def create_presigned_upload(
-    request: Request,
     gateway: GatewayDep,
     body: PresignRequest,
     idempotent: IdempotentDep,
@@ -120,7 +117,6 @@ def create_presigned_upload(
         raise file_too_large_error(limit)
     fields = body.photo_fields()
     _parse_photo_fields(fields)  # refuses invalid fields before the file is sent
-    request.app.state.rate_limiter.count_upload_bytes(get_caller(request), body.file_size)
     upload_id = new_id()
     put = store.presign_put(
         incoming_key(upload_id),
@@ -275,7 +271,7 @@ def _replay_if_completed(upload: PresignedUpload) -> None:
     assert upload.status is not None
     status_url = json.loads(upload.response_body)["status_url"]
     headers = accepted_headers(status_url) if upload.status == 202 else {"Location": status_url}
-    raise IdempotentReplay(StoredResponse(upload.status, headers, upload.response_body))
+    raise IdempotentReplay(upload.status, headers, upload.response_body)
 
 
 def _parse_photo_fields(values: dict[str, Any]) -> PhotoFields:

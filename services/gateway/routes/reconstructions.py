@@ -18,7 +18,6 @@ from services.gateway.admission import ADMIT_JOB
 from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import GatewayContext, GatewayDep, MapQuery, ReconstructionId
 from services.gateway.idempotency import IdempotentDep, IdempotentRequest
-from services.gateway.json_bodies import JsonRoute
 from services.gateway.responses import JobAcceptedResponse
 from shared.catalog.database.base import get_in_map
 from shared.catalog.jobs import UNFINISHED_STATES
@@ -45,7 +44,7 @@ from shared.responses.reconstructions import (
 )
 from shared.storage.keys import new_checkpoint_key
 
-router = APIRouter(tags=["reconstructions"], route_class=JsonRoute)
+router = APIRouter(tags=["reconstructions"])
 
 IMPORT_PATH = "/reconstructions/import"
 MAX_MODEL_BYTES = 16_000_000

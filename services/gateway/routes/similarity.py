@@ -22,7 +22,6 @@ from services.gateway.dependencies import (
     wait_for_job,
 )
 from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
-from services.gateway.json_bodies import JsonRoute
 from services.gateway.responses import JobAcceptedResponse
 from services.gateway.similarity.execute import find_similar, query_from_job, query_from_photo
 from services.gateway.similarity.geopose import GeoPoseRequest, GeoPoseResponse
@@ -53,7 +52,7 @@ from shared.jobs.wakeups import JobMessage
 from shared.responses.similarity import SimilarityResponse
 from shared.storage.keys import query_key, query_preview_key
 
-router = APIRouter(tags=["similarity"], route_class=JsonRoute)
+router = APIRouter(tags=["similarity"])
 
 GEOPOSE_PATH = "/geopose"
 GEOPOSE_WAIT_SECONDS = 30.0
@@ -202,7 +201,7 @@ def _queue_query(
     idempotent: IdempotentRequest,
 ) -> Job:
     upload = file.complete()
-    with idempotent.claim_form(upload, QUERY_TTL_SECONDS):
+    with idempotent.begin_form(upload, QUERY_TTL_SECONDS):
         for name in upload.fields:
             raise invalid_field_error(name, "is unknown; send filters as query parameters")
         with upload.open(gateway.store) as photo:

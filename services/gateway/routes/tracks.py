@@ -37,7 +37,6 @@ from services.gateway.idempotency import (
     IdempotentFormDep,
     IdempotentRequest,
 )
-from services.gateway.json_bodies import JsonRoute
 from services.gateway.responses import accepted_headers, job_url, url_in_map
 from services.gateway.similarity.search_params import SearchParams
 from services.gateway.tracks.apply_frames import apply_pending_frames, smooth_states
@@ -78,7 +77,7 @@ from shared.responses.tracks import (
     TrackStateResponse,
 )
 
-router = APIRouter(tags=["tracks"], route_class=JsonRoute)
+router = APIRouter(tags=["tracks"])
 
 APPLY_SECONDS = 5.0  # of one read; frames that remain pending are applied by the next one
 
@@ -280,7 +279,7 @@ def _accept_frame(
 ) -> TrackFrame:
     """Store the frame with its job, or return the frame that it repeats."""
     received = file.complete()
-    with idempotent.claim_form(received, QUERY_TTL_SECONDS):
+    with idempotent.begin_form(received, QUERY_TTL_SECONDS):
         form = parse_frame_form(received.fields)
         with received.open(gateway.store) as photo:
             header = read_photo_header(photo, gateway.settings.max_image_pixels)

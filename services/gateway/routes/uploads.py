@@ -190,7 +190,7 @@ def _store_upload(
 ) -> StoreResult:
     """Validate the photo, and store its row, its job and the response in one transaction."""
     upload = file.complete()
-    with idempotent.claim_form(upload):
+    with idempotent.begin_form(upload):
         photo = validate_photo(
             gateway.store, upload, gateway.settings.max_image_pixels, get_caller(request).key_id
         )

@@ -11,7 +11,6 @@ from pydantic import Field, model_validator
 
 from services.gateway.authentication import ADMIN
 from services.gateway.dependencies import NO_PARAMETERS, GatewayDep, PageParams, WebhookId
-from services.gateway.json_bodies import JsonRoute
 from shared.catalog.webhooks import (
     Delivery,
     DeliveryState,
@@ -27,7 +26,7 @@ from shared.http.request_model import RequestModel
 from shared.responses import ResponseModel
 from shared.security.webhook_targets import parse_webhook_url, resolve_webhook_target
 
-router = APIRouter(tags=["administration"], route_class=JsonRoute)
+router = APIRouter(tags=["administration"])
 
 
 class CreateWebhookRequest(RequestModel):

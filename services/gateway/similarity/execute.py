@@ -54,7 +54,6 @@ from shared.responses.similarity import (
 from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
 from shared.search_api.protocol import (
     FeatureReference,
-    Mode,
     RowReference,
     SearchHit,
     SearchRequest,
@@ -190,7 +189,7 @@ def run_similarity_search(
     """
     started = time.perf_counter()
     check_matching_enabled(query.map, search_params)
-    search = _MapSearch(gateway, query, search_params.mode)
+    search = _MapSearch(gateway, query)
     rankings = _rank_photos(search, search_params)
     matches = _match_best_photos(search, rankings, search_params)
     estimate, probabilities = _estimate(search, rankings, matches, search_params)
@@ -268,7 +267,6 @@ class _MapSearch:
 
     gateway: GatewayContext
     query: SimilarityQuery
-    mode: Mode
 
     def find(self, photos: PhotoFilter, depth: int) -> _Found:
         """Return the first `depth` live photos; fewer if there are no more."""
@@ -284,7 +282,6 @@ class _MapSearch:
                     photos=photos,
                     exclude=(query.photo_id,) if query.photo_id else (),
                     background=query.background,
-                    mode=self.mode,
                 )
             )
             with self.gateway.catalog.read() as session:
@@ -303,7 +300,7 @@ class _MapSearch:
         cached.
         """
         gateway, query = self.gateway, self.query
-        key = (query.generation.id, query.map.version, photo_id, self.mode)
+        key = (query.generation.id, query.map.version, photo_id)
         with gateway.neighbours_lock:
             cached = gateway.neighbours.get(key)
         if cached is not None:
@@ -459,14 +456,14 @@ def _no_place_reason(hits: Sequence[SearchHit], photo_filter: PhotoFilter) -> st
 
 def rank_live_photos(gateway: GatewayContext, query: SimilarityQuery, k: int) -> list[SearchHit]:
     """Return the first `k` live photos of the map, most similar first, without an estimate."""
-    return _MapSearch(gateway, query, Mode.AUTO).find(NO_FILTER, k).hits
+    return _MapSearch(gateway, query).find(NO_FILTER, k).hits
 
 
 def missing_log_odds(gateway: GatewayContext, query: SimilarityQuery) -> float | None:
     """Return `PlaceModel.missing_log_odds` of a query; None before the map is evaluated."""
     if query.generation.calibration is None:
         return None
-    search = _MapSearch(gateway, query, Mode.AUTO)
+    search = _MapSearch(gateway, query)
     found = search.find(WITH_PLACE, EVIDENCE_DEPTH)
     model, scheme = _place_model(search)
     if not found.hits:

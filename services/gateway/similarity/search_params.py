@@ -17,7 +17,7 @@ from shared.errors import invalid_field_error
 from shared.geometry.colmap_model import ColmapCamera
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS, parse_tags, parse_time
 from shared.search_api.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
-from shared.search_api.protocol import MAX_MATCHED_PHOTOS, Mode
+from shared.search_api.protocol import MAX_MATCHED_PHOTOS
 
 TIME = "ISO 8601; no offset means UTC"
 DEFAULT_MATCHES = 10
@@ -197,11 +197,6 @@ class RankingParams(BaseModel):
         True,
         description="Add the search to the search history. `false` for programs that search with "
         "many photos.",
-    )
-    mode: Mode = Field(
-        Mode.AUTO,
-        description="Search algorithm. `auto`: the one that reads the fewest rows; `dense`: scans "
-        "every row. Both return the same photos.",
     )
 
     def photos_to_match(self, by_default: bool) -> int:

@@ -15,7 +15,7 @@ from sqlalchemy.orm import InstrumentedAttribute
 from services.steward.periodic_tasks import periodic_task
 from shared.catalog.database.base import db_now, db_now_plus
 from shared.catalog.database.session import Catalog
-from shared.catalog.idempotency import IdempotencyRecord
+from shared.catalog.idempotency import StoredResponse
 from shared.catalog.jobs import Job, JobState
 from shared.catalog.maps import (
     CachedMapStatistics,
@@ -101,7 +101,7 @@ def delete_old_deliveries(catalog: Catalog) -> None:
 
 @periodic_task(10.0)
 def delete_expired_idempotency_keys(catalog: Catalog) -> None:
-    _delete_rows(catalog, IdempotencyRecord.id, IdempotencyRecord.expires_at <= db_now())
+    _delete_rows(catalog, StoredResponse.id, StoredResponse.expires_at <= db_now())
 
 
 def _days_ago(days: float) -> ColumnElement[datetime]:

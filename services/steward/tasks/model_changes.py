@@ -3,7 +3,7 @@
 A generation is complete when each live photo of the active generation has a descriptor or a
 recorded failure in it. It is activated once every live search worker has loaded it. The last check
 and the activation are one transaction under the map's lock, which publishing takes, too, so no
-photo can be missed between them. Search workers that died are removed, or they would block it.
+photo can be missed between them.
 
 The photos are queued by `reindex_jobs`, without that lock; the last check reads only the chunks
 published since.
@@ -45,7 +45,7 @@ from shared.catalog.generations import (
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, UNFINISHED_STATES, WaitingFor
 from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole
-from shared.catalog.processes import delete_dead_search_workers, list_lagging_workers
+from shared.catalog.processes import list_lagging_search_workers
 from shared.catalog.vocabularies import StoredWhitening
 from shared.catalog.webhooks import EventKind, enqueue_event
 from shared.errors import Unprocessable
@@ -62,15 +62,6 @@ MAX_LOST_SHARE = 0.01  # of the searchable photos that a model change may fail t
 MAX_LISTED_PHOTOS = 10
 
 
-@periodic_task(2.0)
-def remove_dead_search_workers(catalog: Catalog) -> None:
-    """Unregister search workers without a recent heartbeat; a paused one registers again."""
-    with catalog.write() as session:
-        removed = delete_dead_search_workers(session)
-    if removed:
-        log.warning("removed %d search workers without a recent heartbeat", removed)
-
-
 def _search_workers_have_loaded(session: Session, job: Job, generation: Generation) -> bool:
     """Return whether every live search worker has loaded the complete generation.
 
@@ -83,15 +74,14 @@ def _search_workers_have_loaded(session: Session, job: Job, generation: Generati
         generation.complete_version = session.get_one(Map, generation.map_id).version
         generation.complete_at = db_now()
         session.flush()
-    lagging = list_lagging_workers(session, generation.id, generation.complete_version)
-    if not lagging:
+    names = list_lagging_search_workers(session, generation.id, generation.complete_version)
+    if not names:
         return True
     job.waiting_for, job.stage = WaitingFor.SEARCH, "load"
     is_slow = select(Generation.complete_at < db_now_plus(-SLOW_LOAD_SECONDS)).where(
         Generation.id == generation.id
     )
     if session.scalar(is_slow):
-        names = [worker.name for worker in lagging]
         if names != job.awaited:
             log.warning(
                 "generation %s is complete, but these search workers have not loaded it after "

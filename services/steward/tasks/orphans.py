@@ -171,21 +171,16 @@ def _select_orphans(catalog: Catalog, prefix: str, batch: list[ObjectInfo]) -> l
     return [info for info in batch if info.key not in referenced]
 
 
-def empty_expired_trash(catalog: Catalog, store: ObjectStore, trash_days: float) -> tuple[int, int]:
-    """Delete objects that were moved to the trash more than `trash_days` ago.
-
-    Returns:
-        The number of deleted objects, and the bytes of the others.
-    """
+def empty_expired_trash(catalog: Catalog, store: ObjectStore, trash_days: float) -> int:
+    """Delete objects moved to the trash over `trash_days` ago; return the bytes of the others."""
     cutoff = _now(catalog) - timedelta(days=trash_days)
-    deleted = remaining_bytes = 0
+    remaining_bytes = 0
     for info in store.list(TRASH):
         if info.modified_at < cutoff:
             store.delete(info.key)
-            deleted += 1
         else:
             remaining_bytes += info.size_bytes
-    return deleted, remaining_bytes
+    return remaining_bytes
 
 
 def _now(catalog: Catalog) -> datetime:

@@ -30,7 +30,6 @@ from sqlalchemy.schema import CreateIndex, CreateTable, DDLElement
 from shared.catalog.database.base import Base
 from shared.catalog.database.errors import DAMAGED, explain_outage, is_permanent, reason_of
 from shared.catalog.database.session import Catalog, TransactionTimeouts
-from shared.config.disk_space import RELEASE_BELOW_BYTES
 from shared.config.private_files import FILE_MODE, make_private_folder
 from shared.errors import Misconfigured, PlacewiseError
 
@@ -43,6 +42,7 @@ ADVISORY_LOCK_ID = 1886151011  # "plac" in ASCII
 # Only other processes that create the tables are waited for.
 MIGRATION_TIMEOUTS = TransactionTimeouts(statement_seconds=0, lock_seconds=60.0)
 VERSION_TABLE = "alembic_version"
+NEARLY_FULL_BYTES = 4 * 1024 * 1024  # opening a catalog may need them
 SCHEMA_POLL_SECONDS = 0.5
 
 
@@ -262,7 +262,7 @@ def _to_misconfigured(path: Path, error: SQLAlchemyError) -> Misconfigured | Non
     if name.startswith(DAMAGED):
         return _damaged_error(path, reason_of(error))
     free = shutil.disk_usage(path.parent).free if path.parent.is_dir() else None
-    full = free is not None and free < RELEASE_BELOW_BYTES
+    full = free is not None and free < NEARLY_FULL_BYTES
     if name == "SQLITE_FULL" or (name.startswith(("SQLITE_IOERR", "SQLITE_CANTOPEN")) and full):
         return Misconfigured(
             "disk_full",

@@ -31,10 +31,6 @@ class StoredWeights(NamedTuple):
 
     path: Path
     licence: str
-    key: str
-    """Identifies the network and the state of its file, for caches of the fingerprint."""
-    fingerprint: Callable[[], str] | None
-    """Computes `Backbone.fingerprint` by reading the file; None if only loading computes it."""
 
 
 class Backbone(ABC):

@@ -46,7 +46,7 @@ from shared.descriptors.backbones.dinov2_weights import (
     open_weights,
     weights_unusable_error,
 )
-from shared.descriptors.weight_files import OnProgress, Shape, TensorFile, file_state
+from shared.descriptors.weight_files import OnProgress, Shape, TensorFile
 from shared.extractor_config.configs import FACETS, ExtractorConfig
 
 PATCH = 14  # pixels
@@ -140,14 +140,7 @@ class Dinov2(Backbone):
         file, shape = open_weights(path, size), SHAPES[size]
         vit = build_empty_vit(shape, layer, facet)
         check_tensor_shapes(file, _shapes(vit), size, shape.registers)
-        # The fingerprint covers only the tensors that this layer and facet use.
-        key = f"{config.backbone} {layer} {facet} {file_state(path)}"
-        return StoredWeights(
-            path,
-            cls.licence,
-            key,
-            lambda: load_vit_weights(vit, file, shape, size, META_DEVICE),
-        )
+        return StoredWeights(path, cls.licence)
 
     @classmethod
     def fetch(cls, config: ExtractorConfig, weights: Path | None, on_progress: OnProgress) -> None:

@@ -21,7 +21,6 @@ from shared.descriptors.backbones import (
     normalise_features,
     normalise_pixels,
 )
-from shared.descriptors.weight_files import file_sha256, file_state
 from shared.errors import Misconfigured
 from shared.extractor_config.configs import ExtractorConfig
 
@@ -68,9 +67,7 @@ class EfficientNetLite0(Backbone):
 
     @classmethod
     def find_weights(cls, config: ExtractorConfig, weights: Path | None) -> StoredWeights:
-        path = weights_path()
-        key = f"{config.backbone} {file_state(path)}"
-        return StoredWeights(path, cls.licence, key, lambda: file_sha256(path))
+        return StoredWeights(weights_path(), cls.licence)
 
     @torch.inference_mode()
     def features(self, pixels: torch.Tensor) -> torch.Tensor:

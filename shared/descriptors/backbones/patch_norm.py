@@ -48,7 +48,7 @@ class PatchNorm(Backbone):
 
     @classmethod
     def find_weights(cls, config: ExtractorConfig, weights: Path | None) -> StoredWeights:
-        return StoredWeights(Path(__file__), cls.licence, cls.fingerprint, lambda: cls.fingerprint)
+        return StoredWeights(Path(__file__), cls.licence)
 
     @torch.inference_mode()
     def features(self, pixels: torch.Tensor) -> torch.Tensor:

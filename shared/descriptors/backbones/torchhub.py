@@ -317,11 +317,10 @@ class TorchHubBackbone(NetworkBackbone):
 
     @classmethod
     def find_weights(cls, config: ExtractorConfig, weights: Path | None) -> StoredWeights:
-        """Find the code; which weights it downloads is known once this version was loaded."""
+        """Find the code, which alone knows where its weights are."""
         assert config.hub is not None
         folder = _find_local_code(config.hub)
-        key = f"{config.hub.module} {code_fingerprint(folder)}"
-        return StoredWeights(folder, _find_licence(folder), key, None)
+        return StoredWeights(folder, _find_licence(folder))
 
     @classmethod
     def fetch(

@@ -10,14 +10,12 @@ what was stored.
 from __future__ import annotations
 
 import base64
-import contextlib
 import hashlib
 import io
-import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import BinaryIO
 
 from minio import signer
 from minio.commonconfig import REPLACE, CopySource
@@ -25,16 +23,11 @@ from minio.error import S3Error
 from minio.helpers import queryencode
 from minio.time import to_amz_date
 
-from shared.errors import NotFound, StorageFull, Unavailable
-from shared.storage.keys import TRASH, check_key, check_note_name
+from shared.errors import NotFound
+from shared.storage.keys import check_key, check_note_name
 from shared.storage.protocol import ObjectInfo, PresignedPut
 from shared.storage.s3.bucket import NO_SUCH_KEY_CODES, Bucket
 from shared.storage.s3.streams import MultipartUpload, S3Reader, S3Writer, read_range
-
-log = logging.getLogger(__name__)
-
-
-T = TypeVar("T")
 
 BUFFER_BYTES = 64 * 1024
 PROBE_KEY = ".placewise-check"  # of a multipart upload that is created and aborted
@@ -47,7 +40,7 @@ class S3Store:
         self.bucket = bucket
 
     def writer(self, key: str) -> S3Writer:
-        return S3Writer(self.bucket, check_key(key), self._free_space_and_retry)
+        return S3Writer(self.bucket, check_key(key))
 
     def put(self, key: str, data: bytes) -> None:
         writer = self.writer(key)
@@ -153,22 +146,18 @@ class S3Store:
     def copy(self, source: str, target: str) -> None:
         client, bucket = self.bucket.client, self.bucket.name
         check_key(source), check_key(target)
-
-        def send() -> None:
-            with self.bucket.translate_errors(source):
-                # The uploader's metadata (content type, encoding) is not copied.
-                client.copy_object(
-                    bucket, target, CopySource(bucket, source), metadata_directive=REPLACE
-                )
-
-        self._free_space_and_retry(send)
+        with self.bucket.translate_errors(source):
+            # The uploader's metadata (content type, encoding) is not copied.
+            client.copy_object(
+                bucket, target, CopySource(bucket, source), metadata_directive=REPLACE
+            )
 
     def move(self, source: str, target: str) -> None:
         self.copy(source, target)
         self.delete(source)
 
     def free_trash(self, min_free_bytes: int) -> int:
-        return 0  # the server's disk is not local; `_free_space_and_retry` handles a full one
+        return 0  # the server's disk is not local
 
     def read_note(self, name: str) -> bytes | None:
         try:
@@ -183,26 +172,6 @@ class S3Store:
 
     def delete_note(self, name: str) -> None:
         self.delete(check_note_name(name))
-
-    def _free_space_and_retry(self, send: Callable[[], T]) -> T:
-        """Call `send`; when the store is full, empty the trash and retry once."""
-        try:
-            return send()
-        except StorageFull:
-            if not self._empty_trash():
-                raise
-        return send()
-
-    def _empty_trash(self) -> bool:
-        """Delete all objects in the trash; return whether there were any."""
-        deleted = 0
-        with contextlib.suppress(Unavailable):
-            for info in self.list(TRASH):
-                self.delete(info.key)
-                deleted += 1
-        if deleted:
-            log.warning("the object store is full: %d objects in the trash were deleted", deleted)
-        return deleted > 0
 
     def check(self) -> None:
         """Check that the bucket exists and is writable.

@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import logging
 import os
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from minio.datatypes import Part
@@ -182,12 +181,8 @@ class S3Writer:
     (`create_bucket`).
     """
 
-    def __init__(
-        self, bucket: Bucket, key: str, retry_when_full: Callable[[Callable[[], None]], None]
-    ) -> None:
-        """`retry_when_full` calls its argument, and once more where it could free space."""
+    def __init__(self, bucket: Bucket, key: str) -> None:
         self._bucket = bucket
-        self._retry_when_full = retry_when_full
         self._key = key
         self._buffer = bytearray()
         self._upload: MultipartUpload | None = None
@@ -196,16 +191,19 @@ class S3Writer:
         remaining = memoryview(data)
         while remaining:
             if len(self._buffer) == PART_BYTES:
-                self._retry_when_full(self._send_part)
+                self._send_part()
             free_bytes = PART_BYTES - len(self._buffer)
             self._buffer += remaining[:free_bytes]
             remaining = remaining[free_bytes:]
 
     def commit(self) -> None:
         if self._upload is None:
-            self._retry_when_full(self._send_whole)
+            with self._bucket.translate_errors():
+                self._bucket.client.put_object(
+                    self._bucket.name, self._key, io.BytesIO(self._buffer), len(self._buffer)
+                )
         else:
-            self._retry_when_full(self._send_part)
+            self._send_part()
             self._upload.complete()
             self._upload = None
 
@@ -219,12 +217,6 @@ class S3Writer:
         except Unavailable as error:
             # They are not visible as an object, and the lifecycle rule removes them.
             log.warning("could not abort the multipart upload of %s: %s", self._key, error.detail)
-
-    def _send_whole(self) -> None:
-        with self._bucket.translate_errors():
-            self._bucket.client.put_object(
-                self._bucket.name, self._key, io.BytesIO(self._buffer), len(self._buffer)
-            )
 
     def _send_part(self) -> None:
         if self._upload is None:

@@ -11,7 +11,7 @@ import pytest
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from services.gateway.photo_search import MetadataFilter, search_photos
+from services.gateway.photo_search import MetadataSearchParams, search_photos
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import Map, get_or_create_default_map, increment_map_version
 from shared.catalog.models import Model, get_or_create_model
@@ -89,7 +89,7 @@ def test_a_deleted_photo_and_one_of_another_map_show_in_no_query(
         assert list(get_live_photos(session, [stays, goes])) == [stays]
         assert find_same_photo(session, map_id, "b" * 64, None) is None
         assert count_live_photos(session, map_id) == 1
-        page, total = search_photos(session, map_id, MetadataFilter(), 10, None)
+        page, total = search_photos(session, map_id, MetadataSearchParams(), 10, None)
         assert ([photo.id for photo in page], total) == ([stays], 1)
         changed = list_photos_changed_since(session, map_id, version)
         assert [(facts.photo_id, facts.findable) for facts in changed] == [(goes, False)]

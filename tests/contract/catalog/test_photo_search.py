@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
-from dataclasses import replace
 from datetime import timedelta, timezone
 from typing import Any
 from uuid import UUID
 
 from sqlalchemy import text
 
-from services.gateway.photo_search import MetadataFilter, search_photos
+from services.gateway.photo_search import MetadataSearchParams, search_photos
 from shared.catalog.database.session import Catalog
 from shared.catalog.photos import Photo, PhotoRole
-from shared.search_api.photo_filter import Circle, PhotoFilter
 from tests.contract.catalog.test_session import MOMENT
 from tests.support.catalog_rows import add_job, add_map, add_photo
 
 
 def found(catalog: Catalog, map_id: UUID, **params: Any) -> set[str]:
     """The names of all photos that match, with the total checked against them."""
-    about = {name: params.pop(name) for name in PhotoFilter.model_fields if name in params}
-    params["photos"] = PhotoFilter(**about)
+    for name in params.keys() & {"upload_after", "upload_before"}:
+        params[name] = params[name].isoformat()
     with catalog.read() as session:
-        page, total = search_photos(session, map_id, MetadataFilter(**params), 1000, None)
+        page, total = search_photos(session, map_id, MetadataSearchParams(**params), 1000, None)
     assert total == len(page)
     return {photo.filename for photo in page}
 
@@ -108,19 +106,22 @@ def test_filters_work_together_in_one_map_and_role(catalog: Catalog, map_id: UUI
         add_photo(session, other, **params)
         for wrong in others:
             add_photo(session, map_id, **(params | wrong))
-    about = PhotoFilter(
-        tags=("t",), place="hall", near=Circle(latitude=45.0701, longitude=7.69, radius_m=100)
-    )
-    conditions = MetadataFilter(
-        filename="x", upload_before=MOMENT, max_file_size=5, photos=about, role=None
-    )
+    query: dict[str, Any] = {
+        "filename": "x",
+        "upload_before": MOMENT.isoformat(),
+        "max_file_size": 5,
+        "tags": "t",
+        "place": "hall",
+        "near": "45.0701,7.69,100",
+    }
     for role, expected in (
         (PhotoRole.DATABASE, {right}),
         (PhotoRole.QUERY, {asking}),
         (None, {right, asking}),
     ):
         with catalog.read() as session:
-            page, total = search_photos(session, map_id, replace(conditions, role=role), 10, None)
+            conditions = MetadataSearchParams(**query, role=role)
+            page, total = search_photos(session, map_id, conditions, 10, None)
         assert {photo.id for photo in page} == expected
         assert total == len(expected)
 
@@ -133,7 +134,7 @@ def pages(
     while True:
         after = (seen[-1].uploaded_at, seen[-1].id) if seen else None
         with catalog.read() as session:
-            page, _ = search_photos(session, map_id, MetadataFilter(), limit, after)
+            page, _ = search_photos(session, map_id, MetadataSearchParams(), limit, after)
         if not page:
             return seen
         assert len(page) <= limit
@@ -177,7 +178,7 @@ def test_the_total_counts_what_matches_and_not_the_page(catalog: Catalog, map_id
     with catalog.write() as session:
         for number in range(7):
             add_photo(session, map_id, tags=["odd"] if number % 2 else [], uploaded_at=MOMENT)
-    odd = MetadataFilter(photos=PhotoFilter(tags=("odd",)))
+    odd = MetadataSearchParams(tags="odd")
     with catalog.read() as session:
         first, total = search_photos(session, map_id, odd, 2, None)
         assert (len(first), total) == (2, 3)

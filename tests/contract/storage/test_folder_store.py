@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import stat
 from datetime import date
@@ -34,29 +33,6 @@ class TestFolderStore(ObjectStoreContract):
         assert store.free_trash(8500) == 2
         assert keys_of(store) == ["originals/b", trash_key("originals/a", days[-1])]
         assert [path.name for path in (store.root / "trash").iterdir()] == ["2026-11-22"]
-
-    def test_full_disk_empties_the_trash_and_goes_on_writing(
-        self, store: FolderStore, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        store.put(trash_key("originals/a", date(2026, 11, 22)), b"garbage")
-        writer = store.writer("originals/b")
-        write = writer._file.write
-
-        class FullWhileThereIsTrash:
-            def write(self, data: memoryview) -> int:
-                if keys_of(store, "trash/"):
-                    raise OSError(errno.ENOSPC, "No space left on device")
-                return write(data)
-
-            def __getattr__(self, name: str) -> object:
-                return getattr(file, name)
-
-        file = writer._file
-        monkeypatch.setattr(writer, "_file", FullWhileThereIsTrash())
-        writer.write(b"a photo")
-        writer.commit()
-        assert keys_of(store) == ["originals/b"]
-        assert store.get("originals/b") == b"a photo"
 
     def test_files_and_folders_are_private_whatever_the_umask_is(self, tmp_path: Path) -> None:
         before = os.umask(0)

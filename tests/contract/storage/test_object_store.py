@@ -5,14 +5,12 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, date, datetime, timedelta
-from typing import Any
 
 import pytest
 
-from shared.errors import NotFound, StorageFull
+from shared.errors import NotFound
 from shared.storage import FolderStore, ObjectStore, OwnedStore
 from shared.storage.keys import OWNER_MARK, trash_key
 from shared.storage.s3 import S3Store
@@ -318,33 +316,6 @@ class TestS3Store(ObjectStoreContract):
         with ThreadPoolExecutor(8) as threads:
             list(threads.map(lambda key: store.put(key, b""), keys))
         assert keys_of(store, "chunks/") == keys
-
-    def test_full_store_empties_the_trash_and_goes_on_writing(
-        self, store: S3Store, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        client = store.bucket.client
-        trashed = [trash_key(f"originals/{n}", date(2026, 11, 22)) for n in range(3)]
-        for name in ("put_object", "_upload_part", "copy_object"):
-            for key in trashed:
-                store.put(key, b"garbage")
-            call = getattr(client, name)
-
-            def refuse_while_there_is_trash(
-                *arguments: Any, call: Callable[..., Any] = call, **options: Any
-            ) -> Any:
-                if keys_of(store, "trash/"):
-                    raise StorageFull("object_store_full", "The object store has no room left.")
-                return call(*arguments, **options)
-
-            with monkeypatch.context() as patched:
-                patched.setattr(client, name, refuse_while_there_is_trash)
-                if name == "copy_object":
-                    store.copy("originals/put_object", f"originals/{name}")
-                else:
-                    size = 1000 if name == "put_object" else 6 * MEGABYTE
-                    store.put(f"originals/{name}", bytes(size))
-            assert keys_of(store, "trash/") == []
-            assert store.head(f"originals/{name}") is not None
 
 
 class TestS3StoreOnMoto(ObjectStoreContract):

@@ -13,14 +13,14 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.installation import Installation
 from shared.catalog.maps import Map
 from shared.catalog.models import Model
-from shared.catalog.processes import RegisteredSearchWorker
+from shared.catalog.processes import RegisteredProcess
 from shared.storage import FolderStore
 from shared.storage.keys import JOURNAL, TRASH
 from tests.integration.in_process_api import Service
 
 ROUNDS = 50
 
-OF_NO_MAP = {kind.__tablename__ for kind in (Installation, Model, RegisteredSearchWorker)}
+OF_NO_MAP = {kind.__tablename__ for kind in (Installation, Model, RegisteredProcess)}
 
 
 def rows(catalog: Catalog) -> Counter[str]:

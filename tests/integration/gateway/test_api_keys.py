@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 import re
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
 from sqlalchemy import select, update
-from starlette.datastructures import Headers
 
 from services.gateway.app import form_paths
-from services.gateway.authentication import ApiKeyAuthenticator
 from shared.catalog.api_keys import ApiKey
 from shared.catalog.photos import Photo
 from shared.ids import new_id
@@ -89,11 +86,10 @@ def test_the_last_use_is_noted_once_a_minute(door: Door) -> None:
     assert first is not None
     door(made["key"], "GET", "/jobs")
     assert used() == first
-    # Another gateway, which has not seen the key yet, leaves a fresh note as it is.
-    keys = ApiKeyAuthenticator(door.catalog)
-    caller = asyncio.run(keys.authenticate(Headers({"authorization": f"Bearer {made['key']}"})))
-    asyncio.run(keys.record_use(caller))
-    assert used() == first
+    with door.catalog.write() as session:
+        session.execute(update(ApiKey).values(last_used_at=datetime(2020, 1, 1, tzinfo=UTC)))
+    door(made["key"], "GET", "/jobs")
+    assert datetime.fromisoformat(used()) >= datetime.fromisoformat(first)
 
 
 def test_a_photo_says_which_key_it_came_in_with(door: Door) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import io
 import tarfile
 from uuid import UUID
@@ -14,11 +13,8 @@ from numpy.typing import NDArray
 from shared.catalog.chunks import list_live_chunks, list_live_rows
 from shared.catalog.generations import Generation
 from shared.ids import new_id
-from shared.matching.features import LocalFeatures
-from shared.storage.chunks import features_key, read_chunk
-from shared.storage.feature_files import read_feature_file
+from shared.storage.chunks import read_chunk
 from tests.integration.in_process_api import Service
-from tests.support.photos import encoded, photo_image
 from tests.support.problems import problem
 
 
@@ -64,33 +60,6 @@ def test_each_row_is_the_descriptor_of_its_line(service: Service) -> None:
         ("'=1+1", "-45.5", "'@a/1.jpg"),  # text is no formula for a spreadsheet
     ]
     assert gone not in {line["image_id"] for line in table}
-
-
-def test_local_features_are_exported_in_the_order_of_the_rows(service: Service) -> None:
-    sizes = [(64, 48), (320, 240), (48, 64)]
-    for number, size in enumerate(sizes):
-        service.upload(encoded(photo_image(number, *size), "PNG"))
-        service.drain()
-    with service.catalog.read() as session:
-        damaged = list_live_chunks(session, session.query(Generation).one().id)[2]
-    service.store.delete(features_key(damaged.object_key))
-    [generation] = service.json("GET", "/generations")
-    path = f"/generations/{generation['generation_id']}/descriptors"
-    answer = service("GET", path, params={"features": "true"})
-    assert len(answer.content) == int(answer.headers["content-length"])
-    with tarfile.open(fileobj=io.BytesIO(answer.content), mode="r:") as tar:
-        member = tar.extractfile("local.features")
-        assert member is not None
-        data = member.read()
-    service.store.put("queries/local.features", data)
-    features = read_feature_file(
-        service.store, "queries/local.features", hashlib.sha256(data).hexdigest()
-    )
-    assert features.model.startswith("xfeat@")
-    found = [LocalFeatures.decode(bytes(row)) for row in features.rows[:2]]
-    assert [(one.width, one.height) for one in found] == sizes[:2]
-    assert [len(one.descriptors) > 0 for one in found] == [False, True]
-    assert features.rows[2] == b"", "its file is lost"
 
 
 def test_descriptors_of_a_generation_that_is_not_there_are_not_found(service: Service) -> None:

@@ -1,4 +1,4 @@
-"""What a request body may contain, and what is checked before it is read."""
+"""What a request body may contain."""
 
 from __future__ import annotations
 
@@ -7,10 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from fastapi.routing import APIRoute
 
-from services.gateway.app import RESOURCES
-from services.gateway.json_bodies import JsonRoute
 from shared.catalog.database.base import db_now
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_map
@@ -74,23 +71,6 @@ def test_no_list_text_or_object_of_a_request_body_is_without_a_limit() -> None:
         ": list",
         "[]: text",
     ]
-
-
-def test_every_route_with_a_body_checks_the_caller_before_reading_it() -> None:
-    routes = [route for module in RESOURCES for route in module.router.routes]
-    with_body = [each for each in routes if isinstance(each, APIRoute) and each.body_field]
-    assert len(with_body) > 10
-    assert all(isinstance(route, JsonRoute) for route in with_body)
-
-
-def test_the_scope_and_the_map_are_checked_before_the_body_is_read(door: Door) -> None:
-    reads, writes = door.key("read")["key"], door.key("write")["key"]
-    broken = {"content": b'{"photos": ['}
-    problem(door(reads, "POST", IMPORT, **broken), 403, "scope_missing")
-    other = {**broken, "params": {"map": "none"}}
-    problem(door(writes, "POST", IMPORT, **other), 404, "map_not_found")
-    json_type = {**broken, "headers": {"Content-Type": "application/json"}}
-    problem(door(writes, "POST", IMPORT, **json_type), 400, "malformed_body")
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,7 @@ def test_the_file_of_a_vocabulary_is_what_another_map_imports(vlad: Service) -> 
     assert answer.headers["content-disposition"].endswith(f'{listed["vocabulary_id"]}.npz"')
     file = decode_vocabulary(answer.content)
     assert (file.provenance, file.centres.sha256) == (listed["provenance"], listed["sha256"])
-    assert file.encode() == answer.content, "as `vocabulary fit DIR --out` writes it"
+    assert file.encode() == answer.content, "as it was written"
 
     vlad.json("POST", "/maps", 201, json={"name": "other", "extractor": "test-tiny-vlad"})
     of_other = {"map": "other"}

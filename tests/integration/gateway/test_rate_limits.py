@@ -81,23 +81,6 @@ def test_calls_beyond_the_limit_are_refused_and_every_answer_says_how_far_it_is(
     assert "ratelimit" not in limited(ADMIN, "GET", "/jobs").headers
 
 
-def test_bytes_beyond_the_days_quota_are_refused_before_they_are_sent(
-    limited: Door, store: FolderStore
-) -> None:
-    size = len(photo_bytes(1))
-    key = limited.key("write", upload_bytes_per_day=2 * size)["key"]
-    assert limited.put(key, 1).status_code == 202
-    before = {info.key for info in store.list("")}
-    refused = limited.put(key, 2)
-    problem(refused, 429, "upload_quota_reached")
-    assert int(refused.headers["retry-after"]) > 60
-    assert {info.key for info in store.list("")} == before
-    refused = limited(
-        key, "POST", "/upload", content=iter([b"x"]), headers={"Content-Type": "text/plain"}
-    )
-    problem(refused, 411, "length_required")
-
-
 def test_settings_limit_keys_that_have_no_limit_of_their_own(
     catalog: Catalog, store: FolderStore, settings: Settings
 ) -> None:
@@ -165,7 +148,7 @@ def test_tracks_and_their_frames_count_in_the_limits_of_their_key(
         files = {"file": ("frame.jpg", photo_bytes(number))}
         return door(key, "POST", f"/tracks/{track_id}/frames", data=data, files=files)
 
-    key = door.key("read", max_photos=3, upload_bytes_per_day=1_000_000)["key"]
+    key = door.key("read", max_photos=3)["key"]
     begun = door(key, "POST", "/tracks", json={})
     track_id = begun.json()["track_id"]
     assert [send(key, track_id, number).status_code for number in (1, 2)] == [202, 202]
@@ -177,8 +160,6 @@ def test_tracks_and_their_frames_count_in_the_limits_of_their_key(
 
     calls = door.key("read", requests_per_minute=1)["key"]
     assert [door(calls, "POST", "/tracks", json={}).status_code for _ in "ab"] == [201, 429]
-    few_bytes = door.key("read", upload_bytes_per_day=10)["key"]
-    problem(send(few_bytes, track_id, 5), 429, "upload_quota_reached")
 
 
 def test_parallel_uploads_store_exactly_as_many_photos_as_the_key_may(

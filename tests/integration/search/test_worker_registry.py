@@ -5,32 +5,36 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import BinaryIO
 from uuid import UUID
 
 import pytest
 from sqlalchemy import select, update
 
-from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
-from services.steward.tasks import generation_repair, model_changes
-from services.steward.tasks.generation_repair import repair_generations
-from services.steward.tasks.model_changes import SLOW_LOAD_SECONDS, remove_dead_search_workers
-from shared.catalog.database.base import db_now, db_now_plus
+from services.steward.tasks.model_changes import SLOW_LOAD_SECONDS
+from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import WaitingFor
 from shared.catalog.maps import Map
-from shared.catalog.processes import SEARCH_WORKER_TIMEOUT_SECONDS, RegisteredSearchWorker
+from shared.catalog.processes import (
+    PROCESS_TIMEOUT_SECONDS,
+    RegisteredProcess,
+    list_lagging_search_workers,
+    process_heartbeat,
+    upsert_process,
+)
 from shared.config.settings import Settings
-from shared.jobs import JobState
+from shared.ids import new_id
+from shared.integrity.verify import repair_descriptors, verify_store
+from shared.jobs import InProcessWakeups, JobState
 from shared.search_api.protocol import SearchRequest
-from shared.storage import FolderStore, read_retries
+from shared.storage import FolderStore
 from shared.storage.chunks import encode_rows
 from shared.storage.keys import QUERIES
 from tests.integration.harness import Harness
-from tests.support.catalog_rows import failure_code
 from tests.support.photos import photo_bytes
 from tests.support.waiting import wait_until
 
@@ -59,12 +63,18 @@ class HaltingStore(FolderStore):
 class Registered:
     """A search worker with its entry, which the test runs step by step."""
 
+    catalog: Catalog
     worker: SearchWorker
-    presence: WorkerHeartbeat
+    name: str
+    id: UUID = field(default_factory=new_id)
+
+    def report(self) -> None:
+        with self.catalog.write() as session:
+            upsert_process(session, self.id, "search", self.name, self.worker.state())
 
     def catch_up(self) -> None:
         self.worker.sync()
-        self.presence.send_if_due()
+        self.report()
 
 
 Register = Callable[..., Registered]
@@ -75,9 +85,8 @@ def register(catalog: Catalog, store: FolderStore, settings: Settings) -> Regist
     """A worker that is alive and has loaded what there is."""
 
     def make(name: str, store: FolderStore = store) -> Registered:
-        worker = SearchWorker(catalog, store, settings)
-        made = Registered(worker, WorkerHeartbeat(catalog, worker, name))
-        made.presence.send_if_due()
+        made = Registered(catalog, SearchWorker(catalog, store, settings), name)
+        made.report()
         return made
 
     return make
@@ -101,19 +110,17 @@ def complete(harness: Harness) -> tuple[UUID, UUID]:
     return job_id, generation_id
 
 
-def entries(catalog: Catalog) -> list[RegisteredSearchWorker]:
+def entries(catalog: Catalog) -> list[RegisteredProcess]:
     with catalog.read() as session:
-        return list(
-            session.scalars(select(RegisteredSearchWorker).order_by(RegisteredSearchWorker.name))
-        )
+        return list(session.scalars(select(RegisteredProcess).order_by(RegisteredProcess.name)))
 
 
 def age(catalog: Catalog, name: str, seconds: float) -> None:
     """Set the age of the worker's heartbeat."""
     with catalog.write() as session:
         session.execute(
-            update(RegisteredSearchWorker)
-            .where(RegisteredSearchWorker.name == name)
+            update(RegisteredProcess)
+            .where(RegisteredProcess.name == name)
             .values(seen_at=db_now_plus(-seconds))
             .execution_options(synchronize_session=False)
         )
@@ -159,7 +166,7 @@ def test_a_generation_is_switched_in_once_the_slow_worker_has_loaded_it_too(
         assert slow_store.reached.wait(WAIT_SECONDS), "it does not load what is built"
         fitted.delete(next(iter(found(quick, fitted, old))))  # a change that both have to see
         for _ in range(3):
-            slow.presence.send_if_due()
+            slow.report()
             fitted.advance()
             job = fitted.job(job_id)
             assert (job.waiting_for, job.stage) == (WaitingFor.SEARCH, "load")
@@ -172,7 +179,7 @@ def test_a_generation_is_switched_in_once_the_slow_worker_has_loaded_it_too(
         loading.join()
     fitted.advance()
     assert fitted.active().id == old.id, "it has loaded, and has not reported it yet"
-    slow.presence.send_if_due()
+    slow.report()
     fitted.advance()
     job = fitted.job(job_id)
     assert (job.state, job.waiting_for, job.awaited) == (JobState.SUCCEEDED, None, None)
@@ -189,10 +196,10 @@ def test_a_switch_does_not_wait_for_a_dead_search_worker(
     living.catch_up()
     fitted.advance()
     assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH
-    age(catalog, "dying", SEARCH_WORKER_TIMEOUT_SECONDS - 2)
+    age(catalog, "dying", PROCESS_TIMEOUT_SECONDS - 2)
     fitted.advance()
     assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH, "it may only have paused"
-    age(catalog, "dying", SEARCH_WORKER_TIMEOUT_SECONDS + 1)
+    age(catalog, "dying", PROCESS_TIMEOUT_SECONDS + 1)
     fitted.advance()
     assert fitted.active().id == new_id
     assert dying.worker.status().versions == {}
@@ -222,8 +229,8 @@ def test_a_switch_waits_for_a_live_search_worker_that_has_not_loaded_and_names_i
 
 
 @pytest.mark.parametrize("damage", ["truncated", "gone"])
-def test_a_damaged_chunk_of_what_is_built_is_described_again_and_then_switched_in(
-    fitted: Harness, register: Register, monkeypatch: pytest.MonkeyPatch, damage: str
+def test_a_damaged_chunk_of_what_is_built_is_repaired_and_then_switched_in(
+    fitted: Harness, register: Register, damage: str
 ) -> None:
     worker = register("worker")
     job_id, new_id = complete(fitted)
@@ -234,13 +241,11 @@ def test_a_damaged_chunk_of_what_is_built_is_described_again_and_then_switched_i
     else:
         fitted.store.put(key, whole[:-1])
     worker.catch_up()
-    repair_generations(fitted.catalog, fitted.store)
-    assert fitted.keys(f"chunks/{new_id}/"), "another look may find it whole"
     fitted.advance()
     assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH
 
-    monkeypatch.setattr(model_changes, "SLOW_LOAD_SECONDS", 0.0)
-    repair_generations(fitted.catalog, fitted.store)
+    report = verify_store(fitted.catalog, fitted.store, originals=False)
+    assert repair_descriptors(fitted.catalog, InProcessWakeups(), report) > 0
     fitted.advance()
     assert fitted.job(job_id).waiting_for == WaitingFor.DESCRIPTORS
     fitted.drain()
@@ -250,41 +255,6 @@ def test_a_damaged_chunk_of_what_is_built_is_described_again_and_then_switched_i
     fitted.advance()
     assert fitted.job(job_id).state == JobState.SUCCEEDED
     assert len(found(worker, fitted, fitted.active())) == PHOTOS
-
-
-def test_a_chunk_that_only_its_worker_can_not_read_is_kept_and_loaded_before_the_switch(
-    fitted: Harness, register: Register, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
-    worker = register("worker")
-    job_id, new_id = complete(fitted)
-    key = next(k for k in fitted.keys(f"chunks/{new_id}/") if k.endswith(".npy"))
-    whole = fitted.store.get(key)
-    fitted.store.put(key, whole[:-1])
-    worker.catch_up()
-    fitted.store.put(key, whole)
-    monkeypatch.setattr(model_changes, "SLOW_LOAD_SECONDS", 0.0)
-    repair_generations(fitted.catalog, fitted.store)
-    fitted.advance()
-    assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH
-    worker.catch_up()
-    fitted.advance()
-    assert fitted.active().id == new_id
-
-
-def test_a_model_change_whose_chunks_are_damaged_again_and_again_fails(
-    fitted: Harness, register: Register, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(generation_repair, "MAX_REPAIRED_CHUNKS", 0)
-    monkeypatch.setattr(model_changes, "SLOW_LOAD_SECONDS", 0.0)
-    worker, old = register("worker"), fitted.active()
-    job_id, new_id = complete(fitted)
-    key = next(k for k in fitted.keys(f"chunks/{new_id}/") if k.endswith(".npy"))
-    fitted.store.put(key, fitted.store.get(key)[:-1])
-    worker.catch_up()
-    repair_generations(fitted.catalog, fitted.store)
-    assert failure_code(fitted.job(job_id)) == "chunk_corrupt"
-    assert fitted.active().id == old.id
 
 
 def test_a_photo_that_comes_while_search_loads_is_described_before_the_switch(
@@ -308,39 +278,17 @@ def test_a_photo_that_comes_while_search_loads_is_described_before_the_switch(
 # --- the entries -----------------------------------------------------------------------------
 
 
-def test_a_running_worker_keeps_its_entry_fresh_and_removes_it_in_the_end(
-    register: Register, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+def test_a_search_worker_registers_what_it_loads_and_unregisters_in_the_end(
+    fitted: Harness, register: Register, catalog: Catalog
 ) -> None:
-    monkeypatch.setattr("services.search.service.CHANGE_POLL_SECONDS", 0.01)
-    monkeypatch.setattr("services.search.service.HEARTBEAT_SECONDS", 0.02)
-    worker = register("worker")
-    stop = threading.Event()
-    running = threading.Thread(target=worker.presence.run, args=(stop,))
-    age(catalog, "worker", 100)
-    running.start()
-    try:
-        wait_until(lambda: _seconds_ago(catalog) < 50)
-        with catalog.write() as session:  # by a steward that could not hear of it
-            session.delete(session.get_one(RegisteredSearchWorker, worker.presence.id))
-        wait_until(lambda: bool(entries(catalog)))
-    finally:
-        stop.set()
-        running.join()
-    assert entries(catalog) == []
+    worker, active = register("worker").worker, fitted.active().id
 
+    def registered() -> bool:
+        with catalog.read() as session:
+            return list_lagging_search_workers(session, active, 1) == ["worker"]
 
-def _seconds_ago(catalog: Catalog) -> float:
-    with catalog.read() as session:
-        seen, now = session.execute(select(RegisteredSearchWorker.seen_at, db_now())).one()
-        return float((now - seen).total_seconds())
-
-
-def test_the_steward_removes_the_entries_of_dead_workers(
-    register: Register, catalog: Catalog
-) -> None:
-    register("living")
-    register("dead")
-    age(catalog, "living", SEARCH_WORKER_TIMEOUT_SECONDS - 5)
-    age(catalog, "dead", SEARCH_WORKER_TIMEOUT_SECONDS + 1)
-    remove_dead_search_workers(catalog)
-    assert [entry.name for entry in entries(catalog)] == ["living"]
+    with process_heartbeat(catalog, "search", worker.state):
+        wait_until(lambda: len(entries(catalog)) == 2)
+        worker.sync()
+        wait_until(registered)
+    assert [entry.name for entry in entries(catalog)] == ["worker"]

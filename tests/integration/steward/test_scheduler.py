@@ -19,7 +19,7 @@ from shared.catalog import vocabularies
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import GenerationState
-from shared.catalog.idempotency import IdempotencyRecord, RequestIdentity, claim_idempotency_key
+from shared.catalog.idempotency import StoredResponse
 from shared.catalog.photos import Photo, PresignedUpload
 from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups, Job, JobKind, JobState
@@ -149,8 +149,17 @@ def test_the_loop_runs_each_task(
     chunk_map.store.put(new_original_key(), b"orphan")
     chunk_map.age(chunk_map.objects("originals/"), 60)
     with chunk_map.catalog.write() as session:
-        made = RequestIdentity("someone", "key", "POST /api/v1/maps", "0" * 64)
-        claim_idempotency_key(session, made, lease_seconds=1, life_seconds=-1)
+        session.add(
+            StoredResponse(
+                scope="someone",
+                key="key",
+                fingerprint="0" * 64,
+                status=200,
+                headers={},
+                body="{}",
+                expires_at=db_now_plus(-1),
+            )
+        )
         forgotten = PresignedUpload(
             map_id=chunk_map.map_id,
             filename="a.jpg",
@@ -176,7 +185,7 @@ def test_the_loop_runs_each_task(
     assert wakeups.wait(0)
     chunk_map.check_rows(retained)
     with chunk_map.catalog.read() as session:
-        assert session.scalars(select(IdempotencyRecord.id)).all() == []
+        assert session.scalars(select(StoredResponse.id)).all() == []
         assert session.scalars(select(PresignedUpload.id)).all() == []
         assert session.get_one(Job, lost).state == JobState.QUEUED
         fit = session.scalars(select(Job).where(Job.kind == JobKind.FIT)).one()

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from services.cli import environment
 from services.cli.main import COMMANDS, LAB_COMMANDS, build_app, list_commands
 
 
@@ -47,22 +46,3 @@ def test_without_the_lab_commands_name_it_for_data_sets(
     problem = json.loads(ended.output)
     assert problem["code"] == "lab_missing"
     assert named in problem["detail"]
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["vocabulary", "fit", "{folder}", "--out", "city.npz"],
-        ["models", "fit-pca", "{folder}", "--out", "city.safetensors"],
-    ],
-)
-def test_fits_without_a_server_name_the_lab_where_it_is_missing(
-    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(environment, "find_spec", lambda name: None)
-    filled = [argument.format(folder=tmp_path) for argument in arguments]
-    ended = CliRunner().invoke(build_app([arguments[0]]), [*filled, "--json"])
-    assert ended.exit_code == 1
-    problem = json.loads(ended.output)
-    assert problem["code"] == "lab_missing"
-    assert " ".join(arguments[:2]).removeprefix("models ") in problem["detail"]

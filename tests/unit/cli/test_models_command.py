@@ -13,17 +13,14 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from services.cli.descriptors import local_weights
 from services.cli.main import build_app
-from shared.config.settings import Settings
 from shared.descriptors import weight_files
 from shared.descriptors.backbones import torchhub as torchhub_module
-from shared.descriptors.backbones.dinov2 import SHAPES, Dinov2
+from shared.descriptors.backbones.dinov2 import SHAPES
 from tests.support.files_server import FilesServer, files_server
 from tests.support.hub import COMMIT, write_hub
 from tests.support.vit import random_weights, save
 
-CPU = torch.device("cpu")
 VITS = "anyloc-vits14:layer=0"
 VITS_FILE = "/timm/vit_small_patch14_dinov2.lvd142m/resolve/main/model.safetensors"
 REPOSITORY = f"torchhub:somebody/places@{COMMIT}:colours"
@@ -42,7 +39,6 @@ def caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     from huggingface_hub import constants
 
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "huggingface"))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     monkeypatch.setattr(weight_files, "RETRY_PAUSE_SECONDS", 0)
     return tmp_path
@@ -95,7 +91,7 @@ def test_list_shows_available_weights_and_how_to_get_missing_ones(
     assert (here["available"], here["licence"]) == (True, "Apache-2.0")
     assert here["size_bytes"] == Path(here["path"]).stat().st_size
     missing = listed("anyloc-vitg14")
-    assert (missing["available"], missing["path"], missing["fingerprint"]) == (False, None, None)
+    assert (missing["available"], missing["path"]) == (False, None)
     assert "timm/vit_giant_patch14_dinov2.lvd142m" in missing["source"]
     assert "placewise models fetch anyloc-vitg14" in missing["note"]
     assert not [w for w in command("list") if w["extractor"].startswith("test-")]
@@ -108,41 +104,17 @@ def test_table_shows_every_extractor() -> None:
         assert part in result.output
 
 
-def test_fingerprint_is_that_of_the_spec_and_is_computed_once(
+def test_weights_that_the_setting_names_are_listed_where_they_fit(
     caches: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    weights = random_weights(SHAPES["vits14"], blocks=1)
-    file = save(weights, caches / "vits.pth")
+    file = save(random_weights(SHAPES["vits14"], blocks=1), caches / "vits.pth")
     monkeypatch.setenv("DINO_WEIGHTS", str(file))
     monkeypatch.setenv("EXTRACTOR", VITS)
     found = listed(VITS)
-    assert found["fingerprint"] == Dinov2("vits14", 0, "value", CPU, file).fingerprint
-    assert found["source"] == "DINO_WEIGHTS"
+    assert (found["path"], found["source"]) == (str(file), "DINO_WEIGHTS")
     other = listed("anyloc-vitb14")
     assert not other["available"]
     assert "these look like the weights of dinov2-vits14" in other["note"]
-
-    read: list[Path] = []
-    config = next(r for r in local_weights.list_extractor_configs(Settings()) if r.name == VITS)
-    assert (
-        local_weights.inspect_weights(config, Settings(), read.append).fingerprint
-        == found["fingerprint"]
-    )
-    assert read == [], "it is known by now"
-    save({name: 2 * tensor for name, tensor in weights.items()}, file)
-    assert (
-        local_weights.inspect_weights(config, Settings(), read.append).fingerprint
-        != found["fingerprint"]
-    )
-    assert read == [file]
-
-
-def test_a_corrupt_cache_of_fingerprints_is_rebuilt(caches: Path) -> None:
-    first = listed("efficientnet-lite0-vlad")
-    memory = caches / "cache" / "placewise" / "fingerprints.json"
-    assert first["fingerprint"] in memory.read_text()
-    memory.write_text("{")
-    assert listed("efficientnet-lite0-vlad") == first
 
 
 # --- fetch: DINOv2 ---------------------------------------------------------------------------
@@ -152,9 +124,6 @@ def test_weights_are_fetched_ahead_of_time(server: FilesServer, vits_weights: by
     fetched = command("fetch", VITS)
     assert Path(fetched["path"]).read_bytes() == vits_weights
     assert (fetched["available"], fetched["dimension"]) == (True, 64 * 384)
-    backbone = Dinov2("vits14", 0, "value", CPU)
-    assert backbone.fingerprint == fetched["fingerprint"]
-
     count = len(server.requests)
     assert command("fetch", VITS) == fetched
     assert len(server.requests) == count, "a file that is present is not requested again"
@@ -205,16 +174,10 @@ def test_a_repository_is_fetched_at_its_commit_and_tried(
         f"somebody_places_{COMMIT}"
     ]
 
-    monkeypatch.setenv("CODE_ALLOWED", f"{REPOSITORY}  {REPOSITORY}:dimension=8")
+    monkeypatch.setenv("CODE_ALLOWED", REPOSITORY)
     server.files.clear()
     found = listed(REPOSITORY)
-    assert (found["available"], found["fingerprint"]) == (True, fetched["fingerprint"])
-    other = listed(f"{REPOSITORY}:dimension=8")
-    assert not other["available"], "its code is here, and was never loaded that way"
-    assert "placewise models fetch" in other["note"]
-
-    (Path(fetched["path"]) / "networks.py").write_text("changed = True")
-    assert not listed(REPOSITORY)["available"]
+    assert (found["available"], found["path"]) == (True, fetched["path"])
 
 
 def test_weights_of_an_entry_are_downloaded_resumably(server: FilesServer, caches: Path) -> None:

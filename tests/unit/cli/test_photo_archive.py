@@ -15,12 +15,9 @@ from typing import Any
 
 import pytest
 
-from placewise.answers import Uploaded
 from services.cli.ingest.geotags import LocalPhoto, find_photos
 from services.cli.ingest.photo_archive import PhotoArchive, is_archive
-from services.cli.ingest.upload_journal import UploadJournal
 from shared.errors import InvalidRequest, PlacewiseError, TooLarge
-from tests.support.api_responses import UPLOADED
 from tests.support.archives import PACKED, tar_of, zip_of
 
 every_kind = pytest.mark.parametrize("packed", PACKED.values(), ids=PACKED.keys())
@@ -164,18 +161,6 @@ def test_an_archive_that_makes_no_sense_is_refused_as_a_whole(
     path: Path, members: dict[str, bytes], code: str
 ) -> None:
     assert refused(path, zip_of(members)).code == code
-
-
-def test_the_journal_forgets_the_photos_of_an_archive_that_has_changed(
-    path: Path, tmp_path: Path
-) -> None:
-    [(photo, _)] = found_in(path, zip_of({"a.jpg": b"x"}))
-    with UploadJournal(tmp_path / "journal.jsonl", "http://a", None) as journal:
-        journal.add(photo, Uploaded(**UPLOADED))
-    with UploadJournal(tmp_path / "journal.jsonl", "http://a", None) as journal:
-        assert journal.done(photo) is not None
-        path.write_bytes(zip_of({"a.jpg": b"another"}))
-        assert journal.done(photo) is None
 
 
 # --- damaged and hostile archives --------------------------------------------------------------

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import typer
-from PIL import Image
 from typer.testing import CliRunner
 
-from services.cli.match_drawing import CAPTION, GAP
 from services.cli.query import query as query_command
 from tests.support.api_responses import PHOTO, POSE, SIMILAR
 from tests.support.fake_server import FakeServer, running_server
-from tests.support.photos import encoded
 
 PLACES = [
     {"place": "tower/floor 7 [east]/elevator", "probability": 0.614},
@@ -189,59 +185,19 @@ def test_an_answer_without_levels_has_neither_bars_nor_match_probabilities(tmp_p
     assert "certainty" not in path
 
 
-QUERY_SIZE, PHOTO_SIZE = (1280, 960), (320, 240)
-PAIRS = [
-    {"query": [x, y], "photo": [x / 4, y / 4]} for x, y in ((320, 240), (640, 480), (960, 720))
-]
-
-
-def explain(
-    folder: Path, out: str, originals: list[tuple[int, bytes]], **matches: Any
-) -> tuple[int, str]:
-    """Exit code and output of a query whose first photo has PAIRS, and the second none."""
-    (folder / "where.jpg").write_bytes(encoded(Image.new("RGB", QUERY_SIZE, "black"), "JPEG"))
-    photo = {**PHOTO, "width": PHOTO_SIZE[0], "height": PHOTO_SIZE[1], "similarity_score": 0.8}
-    found = [{**photo, "inliers": len(PAIRS), "pairs": PAIRS}, {**photo, "inliers": 0, "pairs": []}]
-    found.append({**photo, "inliers": None, "pairs": None})
-    counts = {"compared": 2, "missing": 1, "reason": None, **matches}
-    sizes = {"query_width": QUERY_SIZE[0], "query_height": QUERY_SIZE[1]}
-    answer = {"similar_images": found, "matches": {**counts, **sizes}}
-    with running_server() as server:
-        server.will_answer(200, {**SIMILAR, **answer})
-        for status, data in originals:
-            server.will_answer(status, data)
-        shown = CliRunner().invoke(
-            app,
-            [str(folder / "where.jpg"), "--server", server.url, "--explain", str(folder / out)],
-            env={"COLUMNS": "120"},
-        )
-    return shown.exit_code, f"{shown.output} {shown.exception}"
-
-
-def test_matching_points_are_drawn_beside_each_other_and_counted(tmp_path: Path) -> None:
-    original = encoded(Image.new("RGB", PHOTO_SIZE, "white"), "JPEG")
-    code, shown = explain(tmp_path, "matches.png", [(200, original)] * 2)
-    assert code == 0, shown
-    assert "2 photos were matched; 1 have no local features." in shown
-    with Image.open(tmp_path / "matches.png") as drawn:
-        width, height = drawn.size
-        assert width == 640 + GAP + 320
-        assert height == 2 * (CAPTION + 480) + GAP
-        colours = {drawn.getpixel((160, CAPTION + 120)), drawn.getpixel((320, CAPTION + 240))}
-        assert (0, 0, 0) not in colours
-        assert len(colours) == 2, "each line has its colour"
-        second = CAPTION + 480 + GAP + CAPTION
-        assert drawn.getpixel((320, second + 240)) == (0, 0, 0), "no points, no lines"
-
-
-def test_a_drawing_without_an_original_or_without_matches_says_why(tmp_path: Path) -> None:
-    missing = json.dumps({"code": "object_not_found", "detail": "The original is missing."})
-    code, shown = explain(tmp_path, "matches.png", [(404, missing.encode())])
-    assert code != 0
-    assert "street.jpg can't be drawn: The original is missing." in shown
-    assert not (tmp_path / "matches.png").exists()
-    code, shown = explain(tmp_path, "matches.png", [], compared=0, reason="It has no texture.")
-    assert code == 0
-    assert "No matching points: It has no texture." in shown
-    assert "was not drawn" in shown
-    assert explain(tmp_path, "matches.jpg", [])[0] != 0
+def test_matched_photos_have_their_points_and_the_others_a_reason(tmp_path: Path) -> None:
+    place: dict[str, Any] = {"headline": "No place.", "reason": "No place is known."}
+    counts: dict[str, Any] = {
+        "compared": 2,
+        "missing": 1,
+        "reason": None,
+        "query_width": 4,
+        "query_height": 3,
+    }
+    shown, _ = query(tmp_path, place, pose={"matches": counts}, inliers=57)
+    assert "2 photos were matched; 1 have no local features." in shown.splitlines()
+    header, row = (line.split() for line in shown.splitlines()[:3:2])
+    assert row[header.index("points")] == "57"
+    counts |= {"compared": 0, "reason": "It has no texture."}
+    shown, _ = query(tmp_path, place, pose={"matches": counts}, inliers=None)
+    assert "No matching points: It has no texture." in shown.splitlines()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -150,20 +149,15 @@ def test_frames_are_turned_as_the_display_matrix_of_the_video_says(
     assert abs(found - shown).mean() < 12
 
 
-def test_raw_stream_is_read_whole_by_the_frame_rate_that_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_raw_stream_without_times_is_refused_with_the_way_to_give_it_some(tmp_path: Path) -> None:
     path = tmp_path / "raw.h264"
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=10)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-        for number in range(30):
-            picture = np.full((48, 64, 3), 40 + 60 * (number // 10), dtype=np.uint8)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode(av.VideoFrame(64, 48, "yuv420p")))
         container.mux(stream.encode())
-    frames = list(read_video_frames(path, FrameTiming(1.0, None, NOON), tmp_path))
-    assert [(f.captured_at - NOON).total_seconds() for f in frames] == [0, 1, 2]
-    assert "10 frames a second are assumed" in capsys.readouterr().err
+    with pytest.raises(InvalidRequest, match=r"ffmpeg -framerate 30 -i raw\.h264 -c copy"):
+        list(read_video_frames(path, UNKNOWN, tmp_path))
 
 
 def test_unreadable_videos_and_a_missing_decoder_are_reported(
@@ -226,7 +220,7 @@ RIDE = track_of(
 
 
 def test_files_of_a_track_have_its_frames_and_no_line_where_it_is_lost(tmp_path: Path) -> None:
-    names = ("csv", "gpx", "geojson")
+    names = ("csv", "gpx")
     files = {name: tmp_path / f"ride.{name}" for name in names}
     check_track_files(list(files.values()))
     for file in files.values():
@@ -244,17 +238,6 @@ def test_files_of_a_track_have_its_frames_and_no_line_where_it_is_lost(tmp_path:
     assert first is not None
     assert first.attrib == {"lat": "45.0000000", "lon": "7.0000000"}
     assert first.findtext("g:time", namespaces=space) == "2026-05-01T12:00:00Z"
-    features = json.loads(files["geojson"].read_text())["features"]
-    lines = [f for f in features if f["properties"]["kind"] == "track"]
-    assert [line["geometry"]["coordinates"] for line in lines] == [[[7.0, 45.0], [7.0, 45.001]]]
-    points = [f["geometry"] for f in features if f["properties"]["kind"] == "frame"]
-    assert [point and point["coordinates"] for point in points] == [
-        [7.0, 45.0],
-        [7.0, 45.001],
-        [7.0, 45.9],
-        None,
-        [7.0, 45.002],
-    ]
     assert located_segments(track_of(None)) == []
 
 

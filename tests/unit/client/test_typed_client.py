@@ -96,7 +96,7 @@ def test_watching_a_job_shows_each_state_and_does_not_raise_its_failure(
 
 
 def test_keys_are_created_with_the_limits_that_are_given(server: FakeServer) -> None:
-    unlimited = dict.fromkeys(("maps", "upload_bytes_per_day", "max_photos"))
+    unlimited = dict.fromkeys(("maps", "max_photos"))
     limits = {"requests_per_minute": 60, **unlimited}
     times = {"created_at": JOB["created_at"], "expires_at": None, "last_used_at": None}
     key = {"id": JOB["job_id"], "name": "me", "prefix": "pw_1", "scopes": ["read"], **limits}

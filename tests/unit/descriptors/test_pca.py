@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import tracemalloc
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
-from safetensors.numpy import load, save
 from sklearn.decomposition import PCA
 
 from shared.descriptors.pca_fit import (
@@ -174,10 +171,8 @@ def fitted() -> PcaWhitening:
     return fit_pca(unit_rows(70, 30), 6)
 
 
-@pytest.mark.parametrize("spec", [None, {"extractor": "test", "preprocessing": {"version": 1}}])
-def test_a_file_holds_the_whole_whitening(
-    fitted: PcaWhitening, spec: dict[str, Any] | None
-) -> None:
+def test_a_file_holds_the_whole_whitening(fitted: PcaWhitening) -> None:
+    spec = {"extractor": "test", "preprocessing": {"version": 1}}
     data = PcaWhiteningFile(fitted, spec).encode()
     read = decode_whitening(data)
     back = read.whitening
@@ -196,52 +191,16 @@ def test_a_whitening_fits_the_descriptors_that_it_was_learnt_from(fitted: PcaWhi
     spec = {"dimension": 30, "backbone": "a", "layer": 3, "decoder": "1", "precision": "float32"}
     known = PcaWhiteningFile(fitted, spec)
     known.check_compatible({**spec, "decoder": "2", "precision": "float16"})
-    PcaWhiteningFile(fitted, None).check_compatible({**spec, "layer": 4})
     with pytest.raises(Unprocessable, match="layer is 4, was 3") as caught:
         known.check_compatible({**spec, "layer": 4})
     assert caught.value.code == "pca_unusable"
-    for either in (known, PcaWhiteningFile(fitted, None)):
-        with pytest.raises(Unprocessable, match="of 30 dimensions, but these have 31"):
-            either.check_compatible({**spec, "dimension": 31})
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("mean", None, "no mean"),
-        ("rows", None, "no rows"),
-        ("mean", np.zeros(29, np.float32), "do not match: "),
-        ("directions", np.zeros(30, np.float32), "do not match: "),
-        ("variances", np.ones(5, np.float32), "do not match: "),
-        ("variances", -np.ones(6, np.float32), "not positive"),
-        ("variances", np.full(6, 9, np.float32), "do not match its variances"),
-        ("mean", np.full(30, np.nan, np.float32), "NaN"),
-        ("mean", np.zeros(30, np.float64), "float64, not float32"),
-        ("rows", np.zeros(2, np.int64), "one number each"),
-    ],
-)
-def test_whitening_files_with_invalid_values_are_refused(
-    fitted: PcaWhitening, name: str, value: NDArray[np.generic] | None, message: str
-) -> None:
-    stored = load(PcaWhiteningFile(fitted, None).encode())
-    if value is None:
-        del stored[name]
-    else:
-        stored[name] = value
-    assert message in unusable(save(stored))
+    with pytest.raises(Unprocessable, match="dimension is 31, was 30"):
+        known.check_compatible({**spec, "dimension": 31})
 
 
 def test_files_that_are_no_whitening_are_refused(fitted: PcaWhitening) -> None:
-    data = PcaWhiteningFile(fitted, None).encode()
+    data = PcaWhiteningFile(fitted, {}).encode()
     for broken in (b"", b"\x93NUMPY", data[:-1], data[:100], data + b"x"):
-        assert "or it is truncated" in unusable(broken)
-    whole = load(data)
-    for spec, reported in (("{", "can't be read"), ("[1]", "is not a JSON object")):
-        assert reported in unusable(save(whole, {"spec": spec}))
-
-
-def unusable(data: bytes) -> str:
-    with pytest.raises(Unprocessable) as caught:
-        decode_whitening(data)
-    assert caught.value.code == "pca_unusable"
-    return caught.value.detail
+        with pytest.raises(Unprocessable, match="or it is truncated") as caught:
+            decode_whitening(broken)
+        assert caught.value.code == "pca_unusable"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from services.search import executor
 from services.search.chunk_loader import LoadedChunk
-from services.search.executor import SCORE_DECIMALS, SearchOptions
+from services.search.executor import SCORE_DECIMALS
 from services.search.photo_columns import PhotoColumns
 from services.search.query_batcher import QueryBatcher
 from services.search.snapshot import Snapshot
@@ -92,11 +92,9 @@ def assert_best(found: list[tuple[UUID, float]], exact: dict[UUID, float], k: in
         assert exact[photo_id] != exact[last_id] or photo_id > last_id
 
 
-def answer(
-    snapshot: Snapshot, query: Rows, selected: NDArray[np.bool_], question: SearchOptions
-) -> SearchResponse:
+def answer(snapshot: Snapshot, query: Rows, selected: NDArray[np.bool_], k: int) -> SearchResponse:
     """Of a query that comes alone."""
-    return executor.execute_query(snapshot, query, selected, question, QueryBatcher())
+    return executor.execute_query(snapshot, query, selected, k, QueryBatcher())
 
 
 def hits_of(found: SearchResponse) -> list[tuple[UUID, float]]:

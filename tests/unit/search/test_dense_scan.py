@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from services.search import dense_scan
 from services.search.dense_scan import float32_error
 from services.search.exact_rerank import RowBlocks
-from services.search.executor import SearchOptions
 from services.search.photo_columns import build_row_mask
 from services.search.snapshot import Snapshot
 from shared.ids import new_id
@@ -53,7 +52,7 @@ def scan(
     exclude: Collection[UUID] = (),
 ) -> SearchResponse:
     row_mask = build_row_mask(snapshot.photos, NO_FILTER, exclude)
-    return answer(snapshot, query, row_mask, SearchOptions(k))
+    return answer(snapshot, query, row_mask, k)
 
 
 @settings(max_examples=40, deadline=None)

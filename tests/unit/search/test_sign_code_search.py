@@ -11,13 +11,12 @@ from hypothesis import given, settings
 
 from services.search import executor, kernels, sign_code_search
 from services.search.chunk_loader import LoadedChunk
-from services.search.executor import SearchOptions
 from services.search.query_batcher import QueryBatcher
 from services.search.sign_code_search import scan_first_level
 from services.search.snapshot import Snapshot
 from shared.codes.sign_codes import encode_signs
 from shared.ids import new_id
-from shared.search_api.protocol import Mode, SearchResponse
+from shared.search_api.protocol import SearchResponse
 from tests.support.servers.handle import wait_until
 from tests.unit.search.search_rows import (
     Case,
@@ -45,7 +44,7 @@ def by_codes(monkeypatch: pytest.MonkeyPatch) -> None:
 @given(case=cases(DIMENSION))
 def test_answers_equal_brute_force_with_order_and_ties(case: Case) -> None:
     snapshot = snapshot_of(case.rows, case.pieces)
-    found = answer(snapshot, case.query, case.selected, SearchOptions(case.k))
+    found = answer(snapshot, case.query, case.selected, case.k)
     assert_best(hits_of(found), case.exact, case.k)
     if case.selected.any():
         assert found.certificate == "statistical"
@@ -59,7 +58,7 @@ def test_rows_of_any_length_are_searched(dimension: int) -> None:
     rows = places(3, 60, dimension)
     everything = np.ones(60, bool)
     for query in rows[:3]:
-        found = answer(snapshot_of(rows), query, everything, SearchOptions(7))
+        found = answer(snapshot_of(rows), query, everything, 7)
         assert_best(hits_of(found), dict(brute_force(rows, query, len(rows), everything)), 7)
         assert found.certificate == "statistical"
 
@@ -67,7 +66,7 @@ def test_rows_of_any_length_are_searched(dimension: int) -> None:
 def test_few_rows_are_read_when_the_place_is_in_the_map() -> None:
     rows = places(1, 2000)
     query = rows[77] + np.float32(0.002) * places(9, 1)[0]
-    found = answer(snapshot_of(rows), query, np.ones(2000, bool), SearchOptions(1))
+    found = answer(snapshot_of(rows), query, np.ones(2000, bool), 1)
     assert found.hits[0].photo_id == photo(77)
     assert found.rows_scanned == 2000
     assert found.rows_reranked < 50
@@ -77,22 +76,10 @@ def test_query_of_any_length_gives_the_same_answer() -> None:
     rows = places(2, 100)
     everything = np.ones(100, bool)
     snapshot = snapshot_of(rows)
-    found = [
-        answer(snapshot, rows[5] * np.float32(s), everything, SearchOptions(5)) for s in (1, 64)
-    ]
+    found = [answer(snapshot, rows[5] * np.float32(s), everything, 5) for s in (1, 64)]
     assert hits_of(found[0]) == hits_of(found[1])
-    nothing = answer(snapshot, np.zeros(DIMENSION, np.float32), everything, SearchOptions(5))
+    nothing = answer(snapshot, np.zeros(DIMENSION, np.float32), everything, 5)
     assert nothing.hits == ()
-
-
-def test_dense_mode_compares_every_row() -> None:
-    rows = places(4, 150)
-    everything = np.ones(150, bool)
-    question = SearchOptions(9, mode=Mode.DENSE)
-    found = answer(snapshot_of(rows), rows[0], everything, question)
-    assert found.certificate == "exhaustive"
-    assert found.max_z is None
-    assert_best(hits_of(found), dict(brute_force(rows, rows[0], len(rows), everything)), 9)
 
 
 def test_few_rows_are_compared_without_codes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,10 +87,8 @@ def test_few_rows_are_compared_without_codes(monkeypatch: pytest.MonkeyPatch) ->
     rows = places(4, 300)
     searched = np.zeros(300, bool)
     searched[:50] = True
-    assert (
-        answer(snapshot_of(rows), rows[0], searched, SearchOptions(3)).certificate == "exhaustive"
-    )
-    everything = answer(snapshot_of(rows), rows[0], ~np.zeros(300, bool), SearchOptions(3))
+    assert answer(snapshot_of(rows), rows[0], searched, 3).certificate == "exhaustive"
+    everything = answer(snapshot_of(rows), rows[0], ~np.zeros(300, bool), 3)
     assert everything.certificate == "statistical"
 
 
@@ -117,7 +102,7 @@ def test_every_row_is_compared_if_sign_codes_contradict_exact_scores() -> None:
     )
     lying = Snapshot(new_id(), new_id(), 1, (wrong,))
     everything = np.ones(200, bool)
-    found = answer(lying, rows[3], everything, SearchOptions(10))
+    found = answer(lying, rows[3], everything, 10)
     assert found.certificate == "exhaustive"
     assert_best(hits_of(found), dict(brute_force(rows, rows[3], len(rows), everything)), 10)
 
@@ -130,7 +115,7 @@ def test_queries_that_come_together_get_the_answers_that_they_get_alone(
     rng = np.random.default_rng(1)
     queries = [rows[row] + np.float32(0.3) * places(row, 1)[0] for row in range(24)]
     requests = [rng.random(500) < rng.choice([1.0, 0.3]) for _ in queries]
-    questions = [SearchOptions(int(rng.choice([1, 5, 30]))) for _ in queries]
+    questions = [int(rng.choice([1, 5, 30])) for _ in queries]
     alone = [answer(snapshot, *one) for one in zip(queries, requests, questions, strict=True)]
     glances = QueryBatcher()
 
@@ -159,5 +144,5 @@ def test_warm_up_compiles_all_kernels() -> None:
     before = {loop.py_func.__name__: len(loop.signatures) for loop in loops}
     assert before["hamming_distances"] == 1
     rows = places(3, 400, 98_304)
-    answer(snapshot_of(rows), rows[0], np.ones(400, bool), SearchOptions(300))
+    answer(snapshot_of(rows), rows[0], np.ones(400, bool), 300)
     assert {loop.py_func.__name__: len(loop.signatures) for loop in loops} == before

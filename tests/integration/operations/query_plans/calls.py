@@ -22,7 +22,7 @@ from services.steward.scheduler import Scheduler
 from shared.catalog.chunks import Descriptor, list_live_chunks, list_live_filter_values
 from shared.catalog.database.session import Catalog
 from shared.catalog.photos import Photo, PhotoRole, list_photos_changed_since
-from shared.catalog.processes import upsert_search_worker
+from shared.catalog.processes import upsert_process
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError
 from shared.ids import new_id
@@ -268,7 +268,7 @@ def _search_calls(
 
     def register() -> None:
         with catalog.write() as session:
-            upsert_search_worker(session, new_id(), "explained", {})
+            upsert_process(session, new_id(), "search", "explained", {"loaded": {}})
 
     def evaluate() -> None:
         with catalog.read() as session:

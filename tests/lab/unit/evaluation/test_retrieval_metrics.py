@@ -18,7 +18,6 @@ from lab.evaluation.ranking import compute_recalls
 from lab.evaluation.recall import compute_hits, recall_at_k
 from lab.evaluation.retrieval_metrics import (
     average_precisions,
-    calibrate_scores,
     compute_metrics,
     distance_error,
     hits_at_k,
@@ -179,30 +178,6 @@ def test_runs_are_compared_query_by_query() -> None:
         paired_differences(np.ones((3, 1)), np.ones((4, 1)), np.arange(3))
 
 
-def test_score_that_separates_right_from_wrong_is_calibrated_and_ranks_them() -> None:
-    random = np.random.default_rng(0)
-    chance = random.uniform(0, 1, 4000)
-    right = random.uniform(0, 1, 4000) < 1 / (1 + np.exp(-12 * (chance - 0.5)))
-    found = calibrate_scores(
-        chance, right, queries_with_positive=4000, clusters=singleton_clusters(4000)
-    )
-    assert found.calibration_error is not None
-    assert found.calibration_error < 0.03
-    assert found.auroc is not None
-    assert found.auroc > 0.9
-    assert 0 < found.recall_at_99_precision < right.mean()
-
-
-def test_score_without_information_or_too_few_queries_is_reported_as_such() -> None:
-    random = np.random.default_rng(1)
-    right, scores = random.uniform(0, 1, 2000) < 0.5, random.uniform(0, 1, 2000)
-    found = calibrate_scores(scores, right, 2000, singleton_clusters(2000))
-    assert found.auroc == pytest.approx(0.5, abs=0.05)
-    assert found.recall_at_99_precision < 0.02
-    found = calibrate_scores(np.linspace(0, 1, 10), np.ones(10, bool), 10, singleton_clusters(10))
-    assert (found.auroc, found.calibration_error, found.recall_at_99_precision) == (None, None, 1.0)
-
-
 def test_all_figures_of_a_ranking_come_together() -> None:
     scores = np.array([[0.9, 0.1, 0.1], [0.2, 0.1, 0.1], [0.3, 0.1, 0.1], [0.4, 0.1, 0.1]])
     metres = np.array([[3.0, 9, 9], [100, 9, 9], [200, 9, 9], [np.nan, 9, 9]])
@@ -217,6 +192,7 @@ def test_all_figures_of_a_ranking_come_together() -> None:
     assert found["recall_interval"] is None, "four clusters are too few"
     assert found["precision_recall"]["area"] == pytest.approx(1 / 3)
     assert found["distance_error"]["median_m"] == 100
+    assert (found["auroc"], found["recall_at_99_precision"]) == (1.0, pytest.approx(1 / 3))
     assert found["intervals"]["clusters"] == "queries"
     json.dumps(found, allow_nan=False)
 

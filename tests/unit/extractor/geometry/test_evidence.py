@@ -15,8 +15,8 @@ from services.extractor.geometry.evidence import (
     explain_left_out,
     find_misplaced,
 )
-from services.extractor.geometry.mapping import PhotoToMap
 from services.extractor.geometry.matching import VerifiedMatches, match_pairs
+from services.extractor.geometry.pycolmap_models import PhotoToMap
 from shared.geometry.frames import rotation_of_vector
 from shared.matching.matchers import MutualNearest
 from tests.support.reconstructed_scene import ReconstructedScene, looking

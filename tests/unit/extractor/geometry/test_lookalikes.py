@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from services.extractor.geometry.lookalikes import find_lookalikes
-from services.extractor.geometry.mapping import PhotoToMap, map_photos
+from services.extractor.geometry.mapping import map_photos
 from services.extractor.geometry.matching import match_pairs
+from services.extractor.geometry.pycolmap_models import PhotoToMap
 from shared.geometry.component import NO_POINT, Component
 from shared.geometry.frames import rotation_of_vector
 from shared.matching.features import LocalFeatures

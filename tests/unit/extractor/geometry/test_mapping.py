@@ -9,16 +9,15 @@ import numpy as np
 import pycolmap
 import pytest
 
+from services.extractor.geometry.imported_models import import_model, turned_camera
 from services.extractor.geometry.mapping import (
     Judged,
     MappedComponent,
-    PhotoToMap,
     count_joined,
-    import_model,
     map_photos,
-    turned_camera,
 )
 from services.extractor.geometry.matching import VerifiedMatches, match_pairs
+from services.extractor.geometry.pycolmap_models import PhotoToMap
 from shared.errors import Unprocessable
 from shared.geometry.cameras import Camera, Rays
 from shared.geometry.colmap_model import CAMERA_MODELS

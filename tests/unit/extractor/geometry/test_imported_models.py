@@ -6,7 +6,7 @@ from uuid import UUID
 
 import pytest
 
-from services.extractor.geometry.job import match_names
+from services.extractor.geometry.imported_models import match_names
 
 PATHS = ["walk/day 1/a.jpg", "walk/day 2/a.jpg", "b.jpg", "c.jpg", "x/d.jpg", "d.jpg"]
 IDS = {UUID(int=number + 1): path for number, path in enumerate(PATHS)}

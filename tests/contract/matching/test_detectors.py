@@ -1,4 +1,4 @@
-"""Every detector of local features, and every matcher, on a photograph and a turned copy of it."""
+"""Each detector of local features, and matches of its features, on a photo and a turned copy."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ from shared.matching.detectors import (
     read_package_weights,
 )
 from shared.matching.features import FULL_SIDE, MAX_KEYPOINTS, LocalFeatures
-from shared.matching.lightglue import LightGlueMatcher
-from shared.matching.matchers import Matcher, MutualNearest
+from shared.matching.matchers import MutualNearest
 from shared.matching.verification import verify_matches
 from shared.matching.xfeat import refine_keypoints
 
@@ -110,26 +109,15 @@ class TestDetector:
         assert (detector, len(sha256)) == (name, 12)
 
 
-MATCHERS = [
-    pytest.param("xfeat", "mutual nearest", id="xfeat-mutual-nearest"),
-    pytest.param("xfeat", "LightGlue", id="xfeat-lightglue"),
-    pytest.param("aliked-n16", "mutual nearest", id="aliked-mutual-nearest"),
-    pytest.param("aliked-n16", "LightGlue", id="aliked-lightglue"),
-]
-
-
-@cache
-def matcher_of(detector: str, kind: str) -> Matcher:
-    if kind == "LightGlue":
-        return LightGlueMatcher(detector, CPU)
+def matcher_of(detector: str) -> MutualNearest:
     return MutualNearest.of_model(detector_of(detector).model)
 
 
-@pytest.mark.parametrize(("detector", "kind"), MATCHERS)
-class TestMatcher:
-    def test_verified_matches_show_the_same_points(self, detector: str, kind: str) -> None:
+@pytest.mark.parametrize("detector", DETECTORS)
+class TestMatches:
+    def test_verified_matches_show_the_same_points(self, detector: str) -> None:
         first, second = features_of(detector), features_of(detector, is_turned=True)
-        matches = matcher_of(detector, kind).match(first, second)
+        matches = matcher_of(detector).match(first, second)
         points = [first.working_pixels()[matches[:, 0]], second.working_pixels()[matches[:, 1]]]
         inliers = verify_matches(*points)
         assert inliers.sum() >= 100
@@ -137,16 +125,16 @@ class TestMatcher:
         errors = np.linalg.norm(turn(right[0]) - right[1], axis=1)
         assert np.mean(errors < 3) > 0.9
 
-    def test_each_keypoint_is_matched_at_most_once(self, detector: str, kind: str) -> None:
+    def test_each_keypoint_is_matched_at_most_once(self, detector: str) -> None:
         first, second = features_of(detector), features_of(detector, is_turned=True)
-        matches = matcher_of(detector, kind).match(first, second)
+        matches = matcher_of(detector).match(first, second)
         for column in matches.T:
             assert len(set(column.tolist())) == len(matches)
 
-    def test_a_photo_without_keypoints_matches_nothing(self, detector: str, kind: str) -> None:
+    def test_a_photo_without_keypoints_matches_nothing(self, detector: str) -> None:
         features = features_of(detector)
         empty = LocalFeatures.empty((64, 48), features.descriptors.shape[1])
-        matcher = matcher_of(detector, kind)
+        matcher = matcher_of(detector)
         assert matcher.match(features, empty).shape == (0, 2)
         assert matcher.match(empty, features).shape == (0, 2)
 
