@@ -24,6 +24,7 @@ from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.storage import FolderStore
+from tests.support.compiled_statements import share_compiled_statements
 from tests.support.servers import (
     MilvusServer,
     PostgresServer,
@@ -50,6 +51,7 @@ COMPUTING = ("integration", "contract", "unit")
 # A test makes many objects and little garbage: collecting at Python's 700 objects takes a tenth of
 # the CPU time of tests of the gateway.
 gc.set_threshold(50_000)
+share_compiled_statements()
 # Imports freeze their objects, of which triton would report hundreds as leaked at the end.
 atexit.register(gc.unfreeze)
 # A variable, the paths that are collected where it is set, and what to say where it is not.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from pathlib import Path
 from typing import Any, cast
@@ -19,6 +20,7 @@ calls have in common, see [the API](api.md).
 """
 
 
+@functools.cache
 def openapi_description() -> dict[str, Any]:
     """Build the OpenAPI description; the dependencies are None because no route is called."""
     unused = cast(Any, None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import inspect
 import re
 from collections.abc import Collection, Iterator, Sequence
@@ -40,6 +41,7 @@ def render_page() -> str:
     return "\n".join([HEAD, *_settings(), *_commands(), *_error_codes()])
 
 
+@functools.cache
 def error_codes() -> dict[str, tuple[int, str]]:
     """Return the HTTP status and the message of each error code that the code names, by code.
 

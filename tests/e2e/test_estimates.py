@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import time
 from typing import Any
 
 import httpx2
@@ -32,16 +31,15 @@ def re_encoded(number: int) -> bytes:
 def fill(server: ServerProcess, name: str, numbers: list[int], *about: dict[str, Any]) -> None:
     """A new map with these photos, `about` says what of each; all can be found."""
     got(server.client.post("/api/v1/maps", json={"name": name}), 201)
-    for number, fields in zip(numbers, about, strict=True):
-        answer = server.client.post(
-            "/api/v1/upload",
-            params={"map": name},
-            files={"file": ("photo.jpg", photo_bytes(number))},
-            data={key: str(value) for key, value in fields.items()},
-        )
-        got(answer, 202)
-    while got(server.client.get(f"/api/v1/maps/{name}"))["searchable"] < len(numbers):
-        time.sleep(0.02)
+    put(server, name, [(photo_bytes(n), fields) for n, fields in zip(numbers, about, strict=True)])
+
+
+def put(server: ServerProcess, name: str, photos: list[tuple[bytes, dict[str, Any]]]) -> None:
+    """Upload photos with what is said of them, and wait until all can be found."""
+    uploads = [server.upload(data, map_name=name, **fields) for data, fields in photos]
+    for upload in uploads:
+        job = server.finished(got(upload, 202)["job_id"], map=name)
+        assert job["state"] == "succeeded", job
 
 
 def ask(server: ServerProcess, name: str, data: bytes, **params: Any) -> dict[str, Any]:
@@ -140,12 +138,9 @@ def test_an_estimate_uses_the_photos_with_a_place_and_counts_the_others(
     """Before each photo with coordinates lies one of the same view without any."""
     numbers = [next(fresh) for _ in range(ENOUGH)]
     fill(server, "mixed", numbers, *({"latitude": n, "longitude": 7} for n in range(ENOUGH)))
-    for number in numbers:
-        files = {"file": ("copy.jpg", photo_bytes(number, quality=51))}
-        got(server.client.post("/api/v1/upload", params={"map": "mixed"}, files=files), 202)
-    while got(server.client.get("/api/v1/maps/mixed"))["searchable"] < 2 * ENOUGH:
-        time.sleep(0.02)
-    assert got(server.client.get("/api/v1/maps/mixed"))["located"] == ENOUGH
+    put(server, "mixed", [(photo_bytes(number, quality=51), {}) for number in numbers])
+    there = got(server.client.get("/api/v1/maps/mixed"))
+    assert (there["searchable"], there["located"]) == (2 * ENOUGH, ENOUGH)
     evaluate(server, "mixed")
 
     answers = [

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import time
 
+import psutil
 import pytest
 
 from tests.support.memory import memory_bytes
@@ -74,12 +74,13 @@ def test_a_body_of_millions_of_items_is_refused_in_seconds_and_without_memory(
 ) -> None:
     camera = '{"model":"PINHOLE","width":9,"height":9,"params":[9,9,4,4]}'
     items = ",".join([item] * (12_000_000 // (len(item) + 1)))
-    started, before = time.monotonic(), memory_bytes("VmHWM", server.process.pid)
+    process = psutil.Process(server.process.pid)
+    started, before = sum(process.cpu_times()[:2]), memory_bytes("VmHWM", process.pid)
     answer = server.client.post(
         "/api/v1/reconstructions/import",
         content=f'{{"cameras":[{camera}],"photos":[{items}]}}',
         headers={"content-type": "application/json"},
     )
     assert (answer.status_code, answer.json()["code"]) == (413, "too_many_values")
-    assert time.monotonic() - started < 5
-    assert memory_bytes("VmHWM", server.process.pid) - before < 300_000_000
+    assert sum(process.cpu_times()[:2]) - started < 5
+    assert memory_bytes("VmHWM", process.pid) - before < 300_000_000

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 from tests.support.server import ServerProcess
+from tests.support.waiting import wait_until
 
 # An extractor without a vocabulary of its own, in a map with too few photos to fit one by itself.
 SETTINGS = {"extractor": "test-tiny-vlad"}
@@ -99,10 +100,12 @@ def before(server: ServerProcess) -> Before:
     fit_of_nothing = server.client.post(VOCABULARIES, json={})
     uploads = [server.upload(photo_bytes(n), f"{n}.jpg").json() for n in range(PHOTOS)]
     by_new = server.ask(photo_bytes(0))
-    while True:
+
+    def waiting() -> list[dict[str, Any]]:
         jobs = [got(server.client.get(upload["status_url"])) for upload in uploads]
-        if all(job["waiting_for"] for job in jobs):
-            break
+        return jobs if all(job["waiting_for"] for job in jobs) else []
+
+    jobs = wait_until(waiting, pause=0.1)
     return Before(
         fit_of_nothing=fit_of_nothing,
         photos=[upload["file_id"] for upload in uploads],

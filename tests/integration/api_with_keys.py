@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import httpx2
+from fastapi import FastAPI
 from starlette.testclient import TestClient
 
 from services.gateway.app import create_app
@@ -18,8 +19,20 @@ from shared.jobs import InProcessWakeups
 from shared.security.api_keys import hash_api_key
 from shared.storage import FolderStore
 from tests.support.photos import photo_bytes
+from tools.make_api_page import openapi_description
 
 ADMIN = "the-key-of-the-admin-0123"
+
+
+def make_app(gateway: GatewayContext) -> FastAPI:
+    """The application, which is described already.
+
+    Describing takes a second, and works out the routes, which all applications share. FastAPI
+    otherwise does that at their first calls, which no two threads may make at once.
+    """
+    app = create_app(gateway)
+    app.openapi_schema = openapi_description()
+    return app
 
 
 class Door:
@@ -32,7 +45,7 @@ class Door:
         keys = ApiKeyAuthenticator(catalog, hash_api_key(ADMIN))
         gateway = GatewayContext(catalog, store, InProcessWakeups(), search, settings, keys)
         self.catalog, self.store = catalog, store
-        self.app = create_app(gateway)
+        self.app = make_app(gateway)
         self._client = TestClient(self.app, base_url="http://places.example")
 
     def __call__(self, key: str, method: str, path: str, **options: Any) -> httpx2.Response:

@@ -10,7 +10,6 @@ import httpx2
 from starlette.testclient import TestClient
 
 from services.extractor.worker import ExtractorWorker
-from services.gateway.app import create_app
 from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
 from services.search.worker import SearchWorker
@@ -18,6 +17,7 @@ from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups
 from shared.storage import OwnedStore
+from tests.integration.api_with_keys import make_app
 from tests.support.photos import photo_bytes
 
 API = "/api/v1"
@@ -39,16 +39,9 @@ class Service:
         gateway = GatewayContext(
             catalog, store, self.wakeups, self.search, settings, LocalhostAuthenticator()
         )
-        self._app = create_app(gateway)
-        self._client = TestClient(self._app, base_url="http://localhost")
+        self._client = TestClient(make_app(gateway), base_url="http://localhost")
         self.make_worker = make_worker
         self._worker: ExtractorWorker | None = None
-
-    def let_threads_call(self) -> None:
-        """FastAPI works a route out at its first call. In a gateway that is the one event loop's;
-        here each call has a loop of its own, and no two threads may do it at once.
-        """
-        self._app.openapi()
 
     @property
     def worker(self) -> ExtractorWorker:

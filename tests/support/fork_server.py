@@ -25,6 +25,7 @@ from sqlalchemy.orm import configure_mappers
 import services.cli
 from services.cli import collection_paused
 from shared.config.settings import Settings
+from tools.make_api_page import openapi_description
 
 # Beside the command's own modules: what they import when they run. A module that is missing here is
 # imported by each process that needs it.
@@ -47,6 +48,7 @@ MODULES = (
     "shared.catalog.database.postgres",
     "shared.storage.s3",
     "PIL.JpegImagePlugin",
+    "kornia.feature",
     "anyio._backends._asyncio",
     "httpcore2",
     "numpy.random",
@@ -158,6 +160,7 @@ def _import() -> None:
     # What each process would work out for itself at its first use of them.
     Settings()
     configure_mappers()
+    openapi_description()  # works out all routes
 
 
 def main() -> None:

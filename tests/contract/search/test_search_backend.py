@@ -33,11 +33,8 @@ OpenPort = Callable[..., SearchBackend]
 whatever_the_catalog = pytest.mark.databases("sqlite")
 
 
-class SearchPortContract:
-    """Every promise of the port. A subclass's fixture `port` opens one on the map `places`.
-
-    It may take the time to wait for a version: `port(max_wait_seconds=0.05)`.
-    """
+class AnswersContract:
+    """What depends on how rows are compared. A subclass's fixture `port` opens one on `places`."""
 
     @pytest.fixture
     def places(self, catalog: Catalog, store: FolderStore) -> SmallMap:
@@ -207,12 +204,6 @@ class SearchPortContract:
         places.rows[photo_ids[3]] = hidden
         check()
 
-    def test_search_in_a_map_without_photos_has_no_hits(
-        self, places: SmallMap, port: OpenPort
-    ) -> None:
-        response = port().search(places.request(places.query(unit_rows(1, 1)[0])))
-        assert (response.hits, response.missing) == ((), ())
-
     def test_photo_that_was_just_published_is_found_in_the_same_call(
         self, places: SmallMap, port: OpenPort
     ) -> None:
@@ -225,6 +216,81 @@ class SearchPortContract:
             response = search.search(places.request(places.query(vector[0]), k=20))
             assert fresh in {hit.photo_id for hit in response.hits}
             assert response.snapshot_version == places.version
+
+    def test_deleted_photo_is_left_out_of_the_next_search(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        photo_ids = places.add(unit_rows(1, 6)) + places.add(unit_rows(2, 6))
+        vector = places.rows[photo_ids[3]]
+        reference = places.query(vector)
+        places.delete(photo_ids[0])  # before anything was loaded
+        search = port()
+        response = search.search(places.request(reference, k=20))
+        assert response.hits[0].photo_id == photo_ids[3]
+        assert_answers(response, places.brute_force(vector, 20))
+        for gone in (photo_ids[3], photo_ids[9]):
+            places.delete(gone)
+            response = search.search(places.request(reference, k=20))
+            assert_answers(response, places.brute_force(vector, 20))
+
+    def test_search_returns_photos_of_its_own_map_only(
+        self, places: SmallMap, port: OpenPort, catalog: Catalog, store: FolderStore
+    ) -> None:
+        other = SmallMap(catalog, store)
+        places.add(unit_rows(1, 5))
+        other.add(unit_rows(1, 5))
+        search = port()
+        for one in (places, other):
+            response = search.search(one.request(one.query(unit_rows(1, 1)[0]), k=20))
+            assert {hit.photo_id for hit in response.hits} == set(one.rows)
+
+    def test_queries_from_many_threads_are_exact_while_photos_come_and_go(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        """What a query may see is a whole version: every photo with its own score."""
+        seen: dict[UUID, Rows] = {}
+        rows = unit_rows(0, 20).astype(places.row_type)
+        seen |= dict(zip(places.add(rows), rows, strict=True))
+        vector = unit_rows(99, 1)[0]
+        reference = places.query(vector)
+        search = port()
+        responses: list[SearchResponse] = []
+        done = threading.Event()
+
+        def ask() -> None:
+            while not done.is_set():
+                responses.append(search.search(places.request(reference, k=500)))
+
+        threads = [threading.Thread(target=ask) for _ in range(3)]
+        for thread in threads:
+            thread.start()
+        try:
+            for seed in range(1, 6):
+                rows = unit_rows(seed, 4).astype(places.row_type)
+                photo_ids = places.add(rows)
+                seen |= dict(zip(photo_ids, rows, strict=True))
+                places.delete(photo_ids[1])
+                places.merge()
+        finally:
+            done.set()
+            for thread in threads:
+                thread.join()
+        exact = vector.astype(np.float64) / np.linalg.norm(vector.astype(np.float64))
+        for response in responses:
+            for hit in response.hits:
+                assert hit.score == pytest.approx(float(seen[hit.photo_id] @ exact), abs=1e-6)
+        final = search.search(places.request(reference, k=500))
+        assert_answers(final, places.brute_force(vector, 500))
+
+
+class SearchPortContract(AnswersContract):
+    """Every promise of the port, which may take the time to wait: `port(max_wait_seconds=0.05)`."""
+
+    def test_search_in_a_map_without_photos_has_no_hits(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        response = port().search(places.request(places.query(unit_rows(1, 1)[0])))
+        assert (response.hits, response.missing) == ((), ())
 
     def test_search_raises_search_behind_if_min_version_is_not_reached(
         self, places: SmallMap, port: OpenPort
@@ -249,22 +315,6 @@ class SearchPortContract:
         publisher.join()
         assert response.hits[0].score == pytest.approx(1.0, abs=self.length_error)
         assert response.snapshot_version == request.min_version
-
-    def test_deleted_photo_is_left_out_of_the_next_search(
-        self, places: SmallMap, port: OpenPort
-    ) -> None:
-        photo_ids = places.add(unit_rows(1, 6)) + places.add(unit_rows(2, 6))
-        vector = places.rows[photo_ids[3]]
-        reference = places.query(vector)
-        places.delete(photo_ids[0])  # before anything was loaded
-        search = port()
-        response = search.search(places.request(reference, k=20))
-        assert response.hits[0].photo_id == photo_ids[3]
-        assert_answers(response, places.brute_force(vector, 20))
-        for gone in (photo_ids[3], photo_ids[9]):
-            places.delete(gone)
-            response = search.search(places.request(reference, k=20))
-            assert_answers(response, places.brute_force(vector, 20))
 
     @pytest.mark.parametrize("damage", ["flipped", "truncated", "gone"])
     def test_chunk_that_cannot_be_read_is_named_and_the_rest_served(
@@ -326,17 +376,6 @@ class SearchPortContract:
         assert after.hits == before.hits
         assert after.snapshot_version == before.snapshot_version + 1
 
-    def test_search_returns_photos_of_its_own_map_only(
-        self, places: SmallMap, port: OpenPort, catalog: Catalog, store: FolderStore
-    ) -> None:
-        other = SmallMap(catalog, store)
-        places.add(unit_rows(1, 5))
-        other.add(unit_rows(1, 5))
-        search = port()
-        for one in (places, other):
-            response = search.search(one.request(one.query(unit_rows(1, 1)[0]), k=20))
-            assert {hit.photo_id for hit in response.hits} == set(one.rows)
-
     def test_status_has_rows_versions_and_memory(self, places: SmallMap, port: OpenPort) -> None:
         photo_ids = places.add(unit_rows(1, 5), dead=1)
         places.delete(photo_ids[2])
@@ -350,41 +389,3 @@ class SearchPortContract:
             or status.resident_bytes >= 5 * DIMENSION * np.dtype(places.row_type).itemsize
         )
         assert status.missing == ()
-
-    def test_queries_from_many_threads_are_exact_while_photos_come_and_go(
-        self, places: SmallMap, port: OpenPort
-    ) -> None:
-        """What a query may see is a whole version: every photo with its own score."""
-        seen: dict[UUID, Rows] = {}
-        rows = unit_rows(0, 20).astype(places.row_type)
-        seen |= dict(zip(places.add(rows), rows, strict=True))
-        vector = unit_rows(99, 1)[0]
-        reference = places.query(vector)
-        search = port()
-        responses: list[SearchResponse] = []
-        done = threading.Event()
-
-        def ask() -> None:
-            while not done.is_set():
-                responses.append(search.search(places.request(reference, k=500)))
-
-        threads = [threading.Thread(target=ask) for _ in range(3)]
-        for thread in threads:
-            thread.start()
-        try:
-            for seed in range(1, 6):
-                rows = unit_rows(seed, 4).astype(places.row_type)
-                photo_ids = places.add(rows)
-                seen |= dict(zip(photo_ids, rows, strict=True))
-                places.delete(photo_ids[1])
-                places.merge()
-        finally:
-            done.set()
-            for thread in threads:
-                thread.join()
-        exact = vector.astype(np.float64) / np.linalg.norm(vector.astype(np.float64))
-        for response in responses:
-            for hit in response.hits:
-                assert hit.score == pytest.approx(float(seen[hit.photo_id] @ exact), abs=1e-6)
-        final = search.search(places.request(reference, k=500))
-        assert_answers(final, places.brute_force(vector, 500))

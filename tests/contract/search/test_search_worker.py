@@ -22,6 +22,7 @@ from shared.storage import FolderStore, read_retries
 from shared.storage.chunks import decode_rows
 from tests.contract.search.search_methods import always_by_codes
 from tests.contract.search.test_search_backend import (
+    AnswersContract,
     OpenPort,
     SearchPortContract,
     whatever_the_catalog,
@@ -38,6 +39,7 @@ def port(catalog: Catalog, store: FolderStore, settings: Settings) -> OpenPort:
     return open_port
 
 
+@whatever_the_catalog  # tests of search over HTTP run on PostgreSQL
 class TestSearchWorker(SearchPortContract):
     def test_repaired_chunk_is_served_again_without_a_new_version(
         self, places: SmallMap, settings: Settings, monkeypatch: pytest.MonkeyPatch
@@ -200,7 +202,7 @@ def test_queries_wait_for_one_slow_load_no_longer_than_their_deadline(
 
 
 @whatever_the_catalog
-class TestSearchWorkerByCodes(TestSearchWorker):
+class TestSearchWorkerByCodes(AnswersContract):
     """The same promises where sign codes select the rows first."""
 
     certificate = "statistical"
@@ -238,7 +240,7 @@ class TestSearchWorkerByCodes(TestSearchWorker):
 
 
 @whatever_the_catalog
-class TestSearchWorkerOfFloat16Rows(SearchPortContract):
+class TestSearchWorkerOfFloat16Rows(AnswersContract):
     """The same promises for rows that are stored in half precision, compared as they are stored."""
 
     length_error = 2.0**-11

@@ -18,6 +18,7 @@ from shared.storage import FolderStore
 from tests.integration.api_with_keys import ADMIN, Door
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
+from tools.make_api_page import openapi_description
 
 
 def test_a_key_is_shown_once_and_kept_as_a_hash(door: Door) -> None:
@@ -129,11 +130,11 @@ ALL_MAPS_CALLS = {
 """Calls about no map or all maps; a key for some maps has no admin scope."""
 
 
-def calls(door: Door) -> list[tuple[str, str]]:
+def calls() -> list[tuple[str, str]]:
     """Method and path template of each call that needs a key."""
     found = [
         (method.upper(), path)
-        for path, methods in door.app.openapi()["paths"].items()
+        for path, methods in openapi_description()["paths"].items()
         for method in methods
         if path.startswith(("/api/", "/metrics"))
     ]
@@ -161,7 +162,7 @@ def limited(door: Door) -> str:
 def test_every_call_refuses_a_key_of_another_map(door: Door, limited: str, maps: list[str]) -> None:
     open_calls = [
         f"{method} {path}"
-        for method, path in calls(door)
+        for method, path in calls()
         if refusal(door, limited, method, path, maps) not in ("map_not_allowed", "scope_missing")
     ]
     assert open_calls == ["GET /api/v1/maps"], "which lists the maps of the key"
@@ -171,7 +172,7 @@ def test_every_call_refuses_a_key_of_another_map(door: Door, limited: str, maps:
 def test_a_key_of_a_map_is_allowed_the_calls_of_its_map_alone(door: Door, limited: str) -> None:
     closed = {
         f"{method} {path}"
-        for method, path in calls(door)
+        for method, path in calls()
         if "/maps/" not in path and refusal(door, limited, method, path, ["a"]) == "map_not_allowed"
     }
     assert closed == ALL_MAPS_CALLS
@@ -182,7 +183,7 @@ def test_a_key_of_a_map_is_allowed_the_calls_of_its_map_alone(door: Door, limite
 
 
 def test_the_calls_that_receive_a_form_are_those_without_a_limit_on_its_body(door: Door) -> None:
-    paths = door.app.openapi()["paths"]
+    paths = openapi_description()["paths"]
     forms = [
         path
         for path, methods in paths.items()

@@ -154,7 +154,6 @@ def test_uploads_while_their_map_is_deleted_are_refused_or_go_with_it(
         service.json("DELETE", "/maps/gone")
         remove_all(catalog, store)
 
-    service.let_threads_call()
     with ThreadPoolExecutor(5) as pool:
         uploads = [pool.submit(upload, number) for number in range(4)]
         deleting = pool.submit(delete)

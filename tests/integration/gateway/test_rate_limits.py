@@ -174,7 +174,6 @@ def test_parallel_uploads_store_exactly_as_many_photos_as_the_key_may(
         return real(*arguments)
 
     monkeypatch.setattr(uploads_module, "validate_photo", examine_together)
-    door.app.openapi()  # a route is worked out at its first call, which no two threads may do
     key = door.key("write", max_photos=most)["key"]
     with ThreadPoolExecutor(uploads) as pool:
         answers = list(pool.map(partial(door.put, key), range(uploads)))

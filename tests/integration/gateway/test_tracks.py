@@ -149,7 +149,6 @@ def test_one_track_of_a_caller_is_smoothed_at_a_time(
     service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     track_id = begin(service)
-    service.let_threads_call()
     smoothing, refused = threading.Event(), threading.Event()
 
     def smooth(*_: Any) -> dict[UUID, Any]:

@@ -15,7 +15,7 @@ from tests.integration.operations.query_plans.fill import fill_catalog
 from tests.support.servers import PostgresServer
 
 # The first map has more rows than any statement may read: one that reads it all stands out.
-PHOTOS = 60_000
+PHOTOS = 30_000
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ def _no_collections(worker: MilvusWorker) -> Iterator[None]:
         worker.client.drop_collection(name)
 
 
-class TestSearchOnAMilvusServer(test_milvus.TestSearchOnMilvus):
+class TestSearchOnAMilvusServer(test_milvus.MilvusContract):
     """The same promises of a server."""
 
 

@@ -130,7 +130,7 @@ def test_workers_that_all_stay_behind_are_retried_until_the_deadline(
         ask(tier, places)
     assert caught.value.code == "search_behind"
     assert len(searched) > 2, "it was not retried"
-    assert time.monotonic() - started < 10
+    assert time.monotonic() - started < 60, "2 s, on a busy machine"
 
 
 def test_another_worker_answers_for_one_that_hangs(

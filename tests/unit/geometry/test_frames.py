@@ -167,7 +167,7 @@ def test_bent_model_is_not_aligned() -> None:
 @pytest.mark.parametrize("bias", [False, True], ids=["independent errors", "errors of minutes"])
 def test_covariance_contains_the_error_of_the_alignment(bias: bool) -> None:
     squares = []
-    for seed in range(40):
+    for seed in range(20):
         walk = Walk(PLACES["Turin"], seed=seed)
         if bias:
             rng = np.random.default_rng(seed)

@@ -82,7 +82,7 @@ class AlikeStreets:
         ]
 
 
-@pytest.mark.parametrize(("seed", "noise_m"), [(1, None), (3, 0.0), (5, 30.0)])
+@pytest.mark.parametrize(("seed", "noise_m"), [(1, None), (5, 30.0)])
 def test_streets_that_look_alike_are_components_of_their_own(
     tmp_path: Path, seed: int, noise_m: float | None
 ) -> None:
