@@ -14,7 +14,6 @@ from shared.imaging.preprocessing import get_preprocessing
 GAP = 16  # pixels
 CAPTION = 24  # height of a caption in pixels
 MAX_LINES = 150  # of the most similar points; more hide the photos
-MAX_PIXELS = 500_000_000
 BACKGROUND = "white"
 
 
@@ -25,7 +24,7 @@ def read_photo(data: bytes, name: str) -> Image.Image:
         Unprocessable: `photo_not_drawable`.
     """
     try:
-        decoded = decode_photo(data, get_preprocessing("square224"), MAX_PIXELS, for_detection=True)
+        decoded = decode_photo(data, get_preprocessing("square32"), 5 * 10**8, detection_channels=3)
     except PlacewiseError as error:
         raise photo_not_drawable_error(name, error) from error
     assert decoded.detection_pixels is not None
