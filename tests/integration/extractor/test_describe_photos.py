@@ -16,7 +16,7 @@ from sqlalchemy import func, select
 
 from services.extractor import describe, fits
 from services.extractor.generation_resolver import resolve_generation
-from services.extractor.worker import QUERY_POLL_SECONDS, ExtractorWorker
+from services.extractor.worker import ExtractorWorker
 from services.steward.tasks import auto_fit
 from services.steward.tasks.auto_fit import fit_due_vocabularies
 from shared.catalog.chunks import Chunk, list_live_chunks
@@ -28,6 +28,7 @@ from shared.descriptors.extractor import Extractor
 from shared.descriptors.vocabulary import decode_centres
 from shared.imaging.preprocessing import Pixels
 from shared.jobs import JobKind, JobState
+from shared.jobs.runner import IDLE_POLL_SECONDS
 from shared.storage.chunks import decode_rows, manifest_key
 from shared.storage.keys import query_vector_key, thumbnail_key
 from tests.integration.extractor.conftest import Hook
@@ -211,7 +212,7 @@ def test_no_query_is_described_beside_a_job_marked_alone(
     def ask(_: NDArray[np.uint8]) -> None:
         if not queries:
             queries.append(averages.ask(photo_bytes(99)))
-            time.sleep(3 * QUERY_POLL_SECONDS)
+            time.sleep(2 * IDLE_POLL_SECONDS)
             during.append(JobState(averages.job(queries[0]).state))
 
     before_describing(ask)

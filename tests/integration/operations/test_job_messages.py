@@ -223,7 +223,7 @@ def test_a_thread_that_redis_does_not_answer_is_stuck_unless_redis_answers_nobod
 ) -> None:
     monkeypatch.setattr(celery_node, "STUCK_SECONDS", 3.0)
     settings = Settings(redis_url=own_redis.url)
-    node = CeleryNode(app, settings, "extractor-1@here", wakeups, dict)
+    node = CeleryNode(app, settings, "extractor-1@here", wakeups, dict, list)
     hang, stop = threading.Event(), threading.Event()
     receive = node._receive_messages
 
