@@ -41,8 +41,8 @@ STUCK_SECONDS = 30.0
 class CeleryNode:
     """The Celery worker of this process, called `name`.
 
-    `read_state` returns the device and the models, as the process registers them. `on_query` is
-    called when the message of a query arrives.
+    `read_state` returns device and models, as the process registers them; `on_query` is called when
+    the message of a query arrives.
     """
 
     def __init__(

@@ -123,9 +123,7 @@ def test_two_workers_at_once_describe_each_photo_once(
 
 @pytest.mark.databases("sqlite", "postgresql")
 def test_two_workers_create_one_first_generation_of_a_map(
-    averages: Harness,
-    make_worker: Callable[[], ExtractorWorker],
-    monkeypatch: pytest.MonkeyPatch,
+    averages: Harness, make_worker: Callable[[], ExtractorWorker], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (other,) = averages.upload(1)
     first, second = make_worker(), make_worker()
@@ -244,9 +242,7 @@ def test_queries_and_photos_are_described_while_a_vocabulary_is_fitted(
 
 
 @pytest.mark.usefixtures("fit_at_four_photos")
-def test_photos_wait_for_a_vocabulary_which_is_fitted_once_there_are_enough(
-    vlads: Harness,
-) -> None:
+def test_photos_wait_for_a_vocabulary_which_is_fitted_once_there_are_enough(vlads: Harness) -> None:
     photo_ids = vlads.upload(1, 2, 3)
     query = vlads.ask(photo_bytes(9))
     vlads.drain()
@@ -341,9 +337,7 @@ def test_no_vocabulary_is_fitted_where_it_is_switched_off_or_none_is_used(
 
 
 def test_a_photo_that_finds_no_vocabulary_while_one_is_made_is_not_left_waiting(
-    vlads: Harness,
-    make_worker: Callable[[], ExtractorWorker],
-    monkeypatch: pytest.MonkeyPatch,
+    vlads: Harness, make_worker: Callable[[], ExtractorWorker], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vlads.upload(1, 2)
     slow, quick = make_worker(), make_worker()

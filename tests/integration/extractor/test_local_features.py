@@ -168,11 +168,7 @@ def test_features_of_photos_are_computed_as_the_map_says_and_as_an_evaluation_de
     ],
 )
 def test_query_gets_features_where_its_search_matches_it(
-    harness: Harness,
-    matching: Matching,
-    uses_matches: bool,
-    params: dict[str, Any],
-    expected: bool,
+    harness: Harness, matching: Matching, uses_matches: bool, params: dict[str, Any], expected: bool
 ) -> None:
     harness.upload_bytes(photo_bytes(1))
     harness.drain()

@@ -216,10 +216,7 @@ def done(catalog: Catalog) -> dict[str, int]:
 
 
 def test_a_thread_that_redis_does_not_answer_is_stuck_unless_redis_answers_nobody(
-    wakeups: CeleryJobMessages,
-    app: Celery,
-    own_redis: RedisServer,
-    monkeypatch: pytest.MonkeyPatch,
+    wakeups: CeleryJobMessages, app: Celery, own_redis: RedisServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(celery_node, "STUCK_SECONDS", 3.0)
     settings = Settings(redis_url=own_redis.url)
