@@ -43,7 +43,7 @@ from shared.catalog.database.session import IDLE_SECONDS, Catalog, ChangePoll
 from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState, claimable_condition
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, Unavailable
-from shared.jobs.claim import claim_jobs, has_claimable_jobs
+from shared.jobs.claim import claim_conditions, claim_jobs
 from shared.jobs.leases import get_lease_token, lock_leased_jobs, maintain_lease
 from shared.jobs.model_changes import abandon_generation
 from shared.jobs.transitions import cancel_batch_items, fail_job, requeue_job
@@ -168,7 +168,7 @@ class JobRunner:
         The handler completes the job or requeues it for its next slice. Returns False if there
         was no job.
         """
-        claimed = self.claim()
+        claimed = self.claim() if self.has_jobs() else None  # most looks find none
         if claimed is None:
             return False
         job = claimed.jobs[0]
@@ -192,8 +192,9 @@ class JobRunner:
 
     def has_jobs(self, min_priority: int | None = None, *, alone: bool = True) -> bool:
         """Return whether `claim` with the same arguments would find a job."""
+        found = select(Job.id).where(*claim_conditions(self.kinds, min_priority, alone)).limit(1)
         with self.catalog.read_once() as session:
-            return has_claimable_jobs(session, self.kinds, min_priority, alone=alone)
+            return session.scalar(found) is not None
 
     def count_waiting(self, limit: int) -> int:
         """Count the jobs that `claim` could claim, up to `limit`."""
