@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import shutil
 import tarfile
 import zipfile
 import zlib
@@ -52,8 +53,7 @@ def unpack_archive(path: Path, folder: Path) -> Path | None:
                 zipped.extractall(folder)  # noqa: S202 keeps names inside the folder
         else:
             with tarfile.open(path, encoding="utf-8", errors="replace") as tar:
-                tar.extractall(folder, filter=_without_links)  # noqa: S202 filtered
-                _check_end(tar)
+                _unpack_tar(tar, folder)
     except READ_ERRORS as error:
         raise InvalidRequest(
             "unreadable_file",
@@ -78,10 +78,19 @@ def _open_zip(path: Path) -> zipfile.ZipFile:
     return zipfile.ZipFile(path)
 
 
-def _without_links(member: tarfile.TarInfo, folder: str) -> tarfile.TarInfo | None:
-    if member.size < 0:  # `tarfile` would read the same members for ever
-        raise tarfile.ReadError("a member declares a negative size")
-    return tarfile.data_filter(member, folder) if member.isreg() or member.isdir() else None
+def _unpack_tar(tar: tarfile.TarFile, folder: Path) -> None:
+    """Write the files below the folder, whatever their names; Python has filters since 3.11.4."""
+    for member in tar:
+        if member.size < 0:  # `tarfile` would read the same members for ever
+            raise tarfile.ReadError("a member declares a negative size")
+        source = tar.extractfile(member) if member.isreg() else None
+        if source is not None:
+            parts = (part for part in member.name.split("/") if part not in ("", ".", ".."))
+            file = folder.joinpath(*parts)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with file.open("wb") as target:
+                shutil.copyfileobj(source, target)
+    _check_end(tar)
 
 
 def _check_end(tar: tarfile.TarFile) -> None:
