@@ -43,7 +43,6 @@ from shared.jobs import InProcessWakeups
 from shared.jobs.runner import IDLE_POLL_SECONDS, JobRunner
 from shared.storage import ObjectStore
 from shared.telemetry.logs import forward_logs
-from shared.telemetry.tracing import configure_tracing
 
 # Commands are single bytes: any number of them is one. The end of their pipe means: stop.
 LOOK, REPORT_METRICS = b"l", b"m"
@@ -178,7 +177,6 @@ class _Extractor:
         with (
             extractor_lock(self._settings.placewise_home),
             stop_when_a_thread_crashes(stop.set),
-            configure_tracing(self._settings, "embedded"),
             contextlib.closing(open_catalog(self._settings, "embedded")) as catalog,
         ):
             catalog.commits.announce = lambda: self._send(None)

@@ -1,4 +1,4 @@
-"""Request logging middleware: request ids, log lines, trace spans and metrics of HTTP requests."""
+"""Request logging middleware: request ids, log lines and metrics of HTTP requests."""
 
 from __future__ import annotations
 
@@ -20,7 +20,11 @@ from shared.http.problem_details import (
     REQUEST_ID_SCOPE_KEY,
     problem_response,
 )
-from shared.telemetry.tracing import REQUEST_ID_HEADER, request_id_context, request_id_or_new, span
+from shared.telemetry.request_ids import (
+    REQUEST_ID_HEADER,
+    request_id_context,
+    request_id_or_new,
+)
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +48,7 @@ class RequestRecord:
 
 
 class RequestLogMiddleware:
-    """Outermost middleware: assigns the request id, and logs, traces and measures each request.
+    """Outermost middleware: assigns the request id, and logs and measures each request.
 
     The request id is the client's `X-Request-ID` or a new one, and is returned in the response.
     Unsafe methods and 5xx responses are logged at INFO, other requests at DEBUG.
@@ -104,10 +108,7 @@ class RequestLogMiddleware:
             await send(message)
 
         self._on_start()
-        with (
-            request_id_context(request_id),
-            span(method, [headers.get("traceparent")], request_id=request_id) as current_span,
-        ):
+        with request_id_context(request_id):
             try:
                 await self._app(scope, counted_receive, send_with_request_id)
             except asyncio.CancelledError:
@@ -122,8 +123,6 @@ class RequestLogMiddleware:
                 if disconnected or CLOSED_STATUS_SCOPE_KEY in scope:
                     record.status = scope.get(CLOSED_STATUS_SCOPE_KEY, CLIENT_GONE)
                 record.route = _route_template(scope)
-                current_span.update_name(f"{method} {record.route}")
-                current_span.set_attribute("status", record.status)
                 self._on_end(record)
                 self._log(record, scope, time.perf_counter() - started)
 

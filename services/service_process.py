@@ -15,7 +15,6 @@ from shared.catalog.tables import open_catalog
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.telemetry.logs import configure_logging
-from shared.telemetry.tracing import configure_tracing
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +34,7 @@ Announce = Callable[[str], None]
 
 @contextlib.contextmanager
 def service_process(settings: Settings, name: str) -> Iterator[Catalog]:
-    """Set up logging and tracing, and open the catalog once its schema is current.
+    """Set up logging, and open the catalog once its schema is current.
 
     A thread that crashes stops the process as SIGTERM does.
 
@@ -46,7 +45,6 @@ def service_process(settings: Settings, name: str) -> Iterator[Catalog]:
     configure_logging(settings, name)
     with (
         stop_when_a_thread_crashes(lambda: os.kill(os.getpid(), signal.SIGTERM)),
-        configure_tracing(settings, name),
         contextlib.closing(open_catalog(settings, name)) as catalog,
     ):
         wait_for_schema(catalog, SCHEMA_WAIT_SECONDS)

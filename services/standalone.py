@@ -53,7 +53,6 @@ from shared.jobs import InProcessWakeups
 from shared.security.api_keys import Scope, generate_local_key, hash_api_key, is_loopback
 from shared.telemetry.logs import configure_logging
 from shared.telemetry.metrics_server import serve_metrics
-from shared.telemetry.tracing import configure_tracing
 
 log = logging.getLogger(__name__)
 
@@ -99,7 +98,7 @@ def serve_standalone(settings: Settings, on_ready: Callable[[Standalone], None])
         PlacewiseError: As `run_standalone` and `Standalone.serve` raise it.
     """
     configure_logging(settings, "embedded", for_operators=False)
-    with configure_tracing(settings, "embedded"), run_standalone(settings) as running:
+    with run_standalone(settings) as running:
         on_ready(running)
         running.serve()
 

@@ -20,7 +20,6 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 import typer
-from PIL import Image, ImageOps
 
 from lab.benchmarks.estimates import (
     DescribedPhotos,
@@ -33,14 +32,17 @@ from lab.benchmarks.estimates import (
 from lab.benchmarks.report import Report, printed_report
 from services.cli.output import JsonOption
 from shared.evaluation.places.evidence import match_support
+from shared.imaging.decode import decode_photo
+from shared.imaging.preprocessing import get_preprocessing
 from shared.matching.detectors import Detector, load_detector
-from shared.matching.features import WORKING_SIDE, LocalFeatures
+from shared.matching.features import LocalFeatures
 from shared.matching.matchers import MutualNearest
 from shared.matching.verification import verify_matches
 
 MAX_FEATURES_MS = 70.0
 MAX_PAIR_MS = 12.0
 MAX_XFEAT_BYTES = 80_000
+SQUARE = get_preprocessing("square32")
 
 
 class MatchedPhotos:
@@ -97,13 +99,10 @@ def detect_all(
     torch.set_num_threads(1)
     features, seconds = list[LocalFeatures](), 0.0
     for path in paths:
-        with Image.open(path) as image:
-            upright = ImageOps.exif_transpose(image).convert("RGB")
-        scale = min(1.0, WORKING_SIDE / max(upright.size))
-        size = (round(upright.width * scale), round(upright.height * scale))
-        pixels = np.array(upright.resize(size, Image.Resampling.BILINEAR, reducing_gap=2.0))
+        photo = decode_photo(path.read_bytes(), SQUARE, 10**9, detection_channels=detector.channels)
+        assert photo.detection_pixels is not None
         started = time.process_time()
-        features += detector.detect([pixels], [upright.size])
+        features += detector.detect([photo.detection_pixels], [photo.size])
         seconds += time.process_time() - started
         on_photo()
     return features, seconds

@@ -92,7 +92,7 @@ def bench(
 class FreeDetector(Detector):
     """Detector that finds the same keypoints in each photo without looking."""
 
-    dimension = 64
+    dimension, channels = 64, 1
 
     def __init__(self, device: torch.device) -> None:
         super().__init__("xfeat", "0" * 12, device)

@@ -1,6 +1,6 @@
 """An extractor as Celery's tools see it: a worker that receives messages and answers `inspect`.
 
-Two threads, each of which connects to Redis again after an error. Neither runs jobs: those are
+Three threads, each of which connects to Redis again after an error. None runs jobs: those are
 claimed from the job table, with messages or without (decision 17).
 """
 
@@ -36,13 +36,13 @@ HEARTBEAT_SECONDS = 2.0  # as often as Celery's
 POP_SECONDS = 1  # that a look for messages blocks
 # A thread that Redis has not answered for so long, although it answers others, is stuck.
 STUCK_SECONDS = 30.0
-RECEIVED_QUEUES = (WakeupQueue.QUERY, WakeupQueue.BULK)  # the others are polled
 
 
 class CeleryNode:
     """The Celery worker of this process, called `name`.
 
-    `read_state` returns the device and the models, as the process registers them.
+    `read_state` returns device and models, as the process registers them; `on_query` is called when
+    the message of a query arrives.
     """
 
     def __init__(
@@ -52,29 +52,31 @@ class CeleryNode:
         name: str,
         wakeups: CeleryJobMessages,
         read_state: Callable[[], Mapping[str, Any]],
+        on_query: Callable[[], object],
     ) -> None:
         self._app = app
         self._settings = settings
         self._name = name
         self._wakeups = wakeups
-        self._read_state = read_state
+        self._read_state, self._on_query = read_state, on_query
         self._started = time.monotonic()
         self._next_heartbeat = 0.0
         self._idle = threading.Event()
         self._arrived = threading.Event()
-        self._answered_at = dict.fromkeys(("messages", "remote control"), time.monotonic())
+        self._answered_at = dict.fromkeys(self.threads(), time.monotonic())
 
     def threads(self) -> dict[str, Callable[[threading.Event], None]]:
         """Return the functions of the threads by name; each runs until its event is set."""
         return {
             "messages": lambda stop: self._run("messages", self._receive_messages, stop),
+            "queries": lambda stop: self._run("queries", self._receive_queries, stop),
             "remote control": lambda stop: self._run("remote control", self._serve_control, stop),
         }
 
     def wait(self, seconds: float) -> bool:
         """Block until a message arrives or the timeout expires; True when one arrived.
 
-        Messages are taken only meanwhile: those in Redis are the jobs that wait for a worker.
+        Those of photos are taken only meanwhile: in Redis are the jobs that wait for a worker.
         """
         self._idle.set()
         arrived = self._arrived.wait(seconds)
@@ -106,14 +108,23 @@ class CeleryNode:
             stop.wait(RETRY_SECONDS)
 
     def _receive_messages(self) -> Generator[None]:
-        """Take a message while the extractor is idle; which job it names does not matter."""
+        """Take a photo's message while the extractor is idle; of which job does not matter."""
         with open_redis(self._settings) as client:
             while True:
                 if not self._idle.wait(POP_SECONDS):
                     client.ping()
-                elif client.brpop(RECEIVED_QUEUES, POP_SECONDS) is not None:
+                elif client.brpop(WakeupQueue.BULK, POP_SECONDS) is not None:
                     self._idle.clear()
                     self._arrived.set()
+                yield
+
+    def _receive_queries(self) -> Generator[None]:
+        """Take the messages of queries, which are described beside batches."""
+        with open_redis(self._settings) as client:
+            while True:
+                if client.brpop(WakeupQueue.QUERY, POP_SECONDS) is not None:
+                    self._arrived.set()
+                    self._on_query()
                 yield
 
     def _serve_control(self) -> Generator[None]:

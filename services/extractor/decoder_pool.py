@@ -105,7 +105,7 @@ class DecoderPool:
         preprocessing: Preprocessing,
         *,
         previews: Previews = Previews.NONE,
-        for_detection: bool = False,
+        detection_channels: int = 0,
     ) -> list[DecodedPhoto | PlacewiseError]:
         """Decode photos; each result is a decoded photo, or the error that explains the failure.
 
@@ -126,7 +126,7 @@ class DecoderPool:
             preprocessing=preprocessing,
             max_pixels=self._settings.max_image_pixels,
             previews=previews,
-            for_detection=for_detection,
+            detection_channels=detection_channels,
         )
         outcomes: list[DecodedPhoto | PlacewiseError] = []
         pending: deque[tuple[_Decoding, Photo]] = deque()
@@ -134,7 +134,8 @@ class DecoderPool:
             for data in photos:
                 if len(pending) == self._settings.decode_processes * SCHEDULED_PER_PROCESS:
                     outcomes.append(self._result(*pending.popleft(), decode))
-                pending.append((self._schedule(data, decode), data))
+                decoding = _Decoding(self._pool, data, decode, self._timeout_seconds)
+                pending.append((decoding, data))
             while pending:
                 outcomes.append(self._result(*pending.popleft(), decode))
         finally:
@@ -159,9 +160,6 @@ class DecoderPool:
         pool.schedule(os.getpid)  # starts the processes; else the first photo would
         return pool
 
-    def _schedule(self, data: Photo, decode: Decode) -> _Decoding:
-        return _Decoding(self._pool, data, decode, self._timeout_seconds)
-
     def _result(
         self, decoding: _Decoding, data: Photo, decode: Decode
     ) -> DecodedPhoto | PlacewiseError:
@@ -184,7 +182,7 @@ class DecoderPool:
                         f"The decoder crashed on this photo {MAX_DECODE_ATTEMPTS} times "
                         f"({type(error).__name__}).",
                     )
-                decoding = self._schedule(data, decode)
+                decoding = _Decoding(self._pool, data, decode, self._timeout_seconds)
         raise AssertionError("the last attempt returns")
 
     def _await(self, decoding: _Decoding) -> DecodedPhoto:

@@ -116,10 +116,8 @@ def _read_photos(
     photos = _PreparedPhotos(
         lambda pixels: target.extractor.describe(pixels, target.centres, target.projection)
     )
-    for_detection = features is not None and bool(features.missing)
-    decoded, photos.failed = _decode_photos(
-        context, batch, batch.jobs, target, for_detection=for_detection
-    )
+    channels = features.detector.channels if features and features.missing else 0
+    decoded, photos.failed = _decode_photos(context, batch, batch.jobs, target, channels)
     for job, photo in decoded:
         photos.ready.append(job)
         photos.inputs.append(photo.pixels)
@@ -133,8 +131,7 @@ def _decode_photos(
     batch: JobBatch,
     jobs: Sequence[Job],
     target: ResolvedGeneration,
-    *,
-    for_detection: bool,
+    detection_channels: int,
 ) -> tuple[list[tuple[Job, DecodedPhoto]], list[tuple[Job, PlacewiseError]]]:
     """Read and decode the photos of some jobs of the batch; return them and the failures.
 
@@ -149,7 +146,7 @@ def _decode_photos(
             [StoredPhoto(store, keys[job.id], *_preview_keys(job)) for job in present],
             target.extractor.preprocessing,
             previews=PREVIEWS_BY_KIND.get(batch.kind, Previews.NONE),
-            for_detection=for_detection,
+            detection_channels=detection_channels,
         )
     decoded: list[tuple[Job, DecodedPhoto]] = []
     failed: list[tuple[Job, PlacewiseError]] = []
@@ -224,7 +221,8 @@ def _read_rows(
     ready = [job for job in batch.jobs if job.photo_id in rows]
     if features and features.missing:
         missing = [job for job in ready if job.id in features.missing]
-        decoded, failed = _decode_photos(context, batch, missing, target, for_detection=True)
+        channels = features.detector.channels
+        decoded, failed = _decode_photos(context, batch, missing, target, channels)
         for job, photo in decoded:
             features.add_photo(job, photo)
         for job, error in failed:

@@ -64,7 +64,8 @@ def _run_extractor(
         ) as worker,
         process_heartbeat(catalog, "extractor", worker.state),
     ):
-        node = CeleryNode(app, worker.context.settings, name, wakeups, worker.state)
+        on_query = catalog.commits.count_one  # wakes what waits for queries beside a batch
+        node = CeleryNode(app, worker.context.settings, name, wakeups, worker.state, on_query)
 
         def run_jobs(stop: threading.Event) -> None:
             worker.warm_up(stop)

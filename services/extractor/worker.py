@@ -46,7 +46,7 @@ from shared.errors import PlacewiseError
 from shared.jobs import Job, Priority, Wakeups
 from shared.jobs.claim import fair_batch_size, mark_started
 from shared.jobs.queue_depth import PolledValue
-from shared.jobs.runner import JobRunner
+from shared.jobs.runner import IDLE_POLL_SECONDS, JobRunner
 from shared.jobs.transitions import make_waiting_jobs_claimable
 from shared.storage import ObjectStore
 from shared.telemetry.heartbeat import Heartbeat
@@ -54,7 +54,6 @@ from shared.telemetry.heartbeat import Heartbeat
 log = logging.getLogger(__name__)
 
 DONE = object()  # a handler that has ended
-QUERY_POLL_SECONDS = 0.1  # polling interval for queries while there are other jobs
 QUERY_PAUSE_SECONDS = 0.02  # after a look, where commits are announced
 BATCH_NICENESS = 5  # of the threads that describe a batch: a query gets three times their share
 
@@ -168,7 +167,7 @@ class ExtractorWorker:
     def drain(self, stop: threading.Event) -> bool:
         """Process jobs until none is claimable, or `stop` is set; return whether there was one."""
         self._stop = stop
-        batch = self._claim()
+        batch = self._claim() if self._runner.has_jobs() else None  # most looks find none
         if batch is None:
             return False
         with self._metrics.measure_drain(), self._answering_queries():
@@ -223,9 +222,9 @@ class ExtractorWorker:
             self._wait_for_stages()
             with self._query_lock:
                 self._run(batch, concurrent_jobs=0)
-        elif _is_query(batch):
+        elif batch.jobs[0].priority >= Priority.QUERY:
             self._run(batch)
-        elif self._run_stage(batch, "prepare"):
+        elif self._run_stage(batch):
             self._describing.wait()
             if self._stop.is_set():
                 self._runner.requeue(batch)
@@ -239,13 +238,13 @@ class ExtractorWorker:
 
     def _publish(self, batch: JobBatch) -> None:
         with batch.lease:
-            self._run_stage(batch, "publish")
+            self._run_stage(batch)
 
     def _run(self, batch: JobBatch, concurrent_jobs: int = 1) -> None:
         """Run all stages of a batch in this thread."""
         with batch.lease:
-            if self._run_stage(batch, "prepare") and self._describe(batch, concurrent_jobs):
-                self._run_stage(batch, "publish")
+            if self._run_stage(batch) and self._describe(batch, concurrent_jobs):
+                self._run_stage(batch)
 
     def _describe(self, batch: JobBatch, concurrent_jobs: int = 1) -> bool:
         """Run the stage that needs the model; of `concurrent_jobs`, any may cause a crash, too."""
@@ -256,13 +255,11 @@ class ExtractorWorker:
                 mark_started(session, batch.token, len(batch.jobs) + concurrent_jobs)
             self._runner.report_started(batch)
 
-        return self._run_stage(batch, "describe", mark_jobs)
+        return self._run_stage(batch, mark_jobs)
 
-    def _run_stage(
-        self, batch: JobBatch, name: str, begin: Callable[[], None] = lambda: None
-    ) -> bool:
+    def _run_stage(self, batch: JobBatch, begin: Callable[[], None] = lambda: None) -> bool:
         """Run the batch's next stage; return whether one follows."""
-        with self._runner.step(batch, name):
+        with self._runner.step(batch):
             begin()
             if next(batch.stages, DONE) is not DONE:
                 return True
@@ -292,11 +289,7 @@ class ExtractorWorker:
                 if query is not None:
                     self._run(query)
             if query is None and not done.wait(QUERY_PAUSE_SECONDS):
-                commits.wait(seen, QUERY_POLL_SECONDS)
-
-
-def _is_query(batch: JobBatch) -> bool:
-    return batch.jobs[0].priority >= Priority.QUERY
+                commits.wait(seen, IDLE_POLL_SECONDS)
 
 
 def _runs_exclusively(batch: JobBatch) -> bool:

@@ -24,7 +24,6 @@ from shared.search_api.protocol import (
     SearchResponse,
     SearchStatus,
 )
-from shared.telemetry.tracing import span
 
 METRIC_PREFIX = "placewise_search"
 # Seconds, from a small map in memory to a dense scan of a full worker, and the longest wait for a
@@ -82,7 +81,7 @@ class MeteredSearch:
 
     def search(self, request: SearchRequest) -> SearchResponse:
         """Search and record the metrics of the response."""
-        with self._measured("searches"), span("search", k=request.k):
+        with self._measured("searches"):
             response = self._worker.search(request)
         self._rows.inc(response.rows_scanned)
         self._reranked.inc(response.rows_reranked)
@@ -93,7 +92,7 @@ class MeteredSearch:
 
     def match(self, request: MatchRequest) -> MatchResponse:
         """Match and record the metrics of the response."""
-        with self._measured("matches"), span("match", photos=len(request.candidates)):
+        with self._measured("matches"):
             response = self._worker.match(request)
         matched = sum(each is not None for each in response.candidates)
         self._matched_photos.labels("matched").inc(matched)
@@ -102,7 +101,7 @@ class MeteredSearch:
 
     def estimate_pose(self, request: PoseRequest) -> PoseResponse:
         """Compute a pose and record whether there is one."""
-        with self._measured("poses"), span("pose", photos=len(request.candidates)):
+        with self._measured("poses"):
             response = self._worker.estimate_pose(request)
         self._pose_answers.labels("no_pose" if response.pose is None else "found").inc()
         return response

@@ -1,9 +1,9 @@
 """The installation: the catalog's id, and the object store that belongs to it.
 
 Objects that a catalog does not refer to are collected as orphans, so a store must belong to exactly
-one catalog. The store has a mark with the catalog's id (`shared.storage.ownership`), and the
-catalog stores its bucket. An older copy of the catalog has the same id, but does not know the
-numbers of the journal's last segments (`check_not_behind`).
+one catalog. The store has a mark with the catalog's id (`shared.storage.ownership`). An older copy
+of the catalog has the same id, but does not know the numbers of the journal's last segments
+(`check_not_behind`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from sqlalchemy import BigInteger, CheckConstraint, Integer, Uuid, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.chunks import Chunk
-from shared.catalog.database.base import Base, JsonValue, UtcDateTime, db_now, get_or_insert
+from shared.catalog.database.base import Base, UtcDateTime, db_now, get_or_insert
 from shared.catalog.database.session import Catalog
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
@@ -27,7 +27,7 @@ from shared.ids import new_id
 from shared.storage import ObjectStore, OwnedStore
 from shared.storage.keys import OWNER_MARK
 from shared.storage.open_store import open_store
-from shared.storage.ownership import BucketLocation, bucket_location, check_free, claim_store
+from shared.storage.ownership import check_free, claim_store
 from shared.storage.segments import Segment, list_segments
 
 SAMPLE_KEYS = 20  # per table
@@ -41,8 +41,6 @@ class Installation(Base):
 
     number: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False, default=1)
     id: Mapped[UUID] = mapped_column(Uuid, default=new_id)
-    # Endpoint and name of the bucket with the objects; null if they are in a folder.
-    bucket: Mapped[BucketLocation | None] = mapped_column(JsonValue)
     # Number that this catalog has taken for its last journal segment (`shared.journal`), or
     # REBUILDING until a rebuild has finished.
     journal_sequence: Mapped[int] = mapped_column(BigInteger, default=0, server_default="0")
@@ -66,16 +64,7 @@ def open_installation_store(catalog: Catalog, settings: Settings, *, exclusive: 
     store = open_store(settings, exclusive=exclusive)
     with catalog.write() as session:
         installation = get_or_create_installation(session)
-    place = claim_store(
-        store,
-        installation.id,
-        installation.bucket,
-        settings.placewise_home / "objects",
-        lambda: _sample_referenced_keys(catalog),
-    )
-    if place != installation.bucket:
-        with catalog.write() as session:
-            get_or_create_installation(session).bucket = place
+    claim_store(store, installation.id, lambda: _sample_referenced_keys(catalog))
     check_not_behind(catalog, store)
     return store
 
@@ -133,7 +122,6 @@ def adopt_store(catalog: Catalog, store: OwnedStore) -> None:
     with catalog.write() as session:
         installation = get_or_create_installation(session)
         store.write_note(OWNER_MARK, str(installation.id).encode())
-        installation.bucket = bucket_location(store)
         if installation.journal_sequence != REBUILDING:
             installation.journal_sequence = max(installation.journal_sequence, last)
 

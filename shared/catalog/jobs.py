@@ -46,10 +46,9 @@ from shared.catalog.database.base import (
 )
 from shared.enums import JobState as JobState
 from shared.ids import new_id
-from shared.telemetry.tracing import (
+from shared.telemetry.request_ids import (
     MAX_REQUEST_ID_CHARACTERS,
     current_request_id,
-    current_traceparent,
 )
 
 UNFINISHED_STATES = (JobState.QUEUED, JobState.RUNNING)
@@ -181,11 +180,10 @@ class Job(Base):
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     started_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     finished_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
-    # Of the request, or of the job, that created it: links logs and traces.
+    # Of the request, or of the job, that created it: links logs.
     request_id: Mapped[str | None] = mapped_column(
         String(MAX_REQUEST_ID_CHARACTERS), default=current_request_id
     )
-    traceparent: Mapped[str | None] = mapped_column(String(55), default=current_traceparent)
 
     __table_args__ = (
         # Claiming: first the job with the highest priority, then the rest of its batch.

@@ -299,7 +299,7 @@ def mark_photo_deleted(
 
 
 class PresignedUpload(Base):
-    """A presigned upload. `status` and `response_body` are the response of its completion."""
+    """A presigned upload that is not completed."""
 
     __tablename__ = "direct_uploads"
 
@@ -309,8 +309,6 @@ class PresignedUpload(Base):
     size_bytes: Mapped[int] = mapped_column(sa.BigInteger)
     sha256: Mapped[str] = mapped_column(sa.String(64))
     photo_fields: Mapped[dict[str, Any]] = mapped_column("said", JsonValue, default=dict)
-    status: Mapped[int | None] = mapped_column(sa.Integer)
-    response_body: Mapped[str | None] = mapped_column("answer", sa.Text)  # JSON, as it was sent
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     expires_at: Mapped[datetime] = mapped_column(UtcDateTime)
 
@@ -323,7 +321,7 @@ class PresignedUpload(Base):
 def get_presigned_upload(
     session: Session, map_id: UUID, upload_id: UUID, *, lock: bool = False
 ) -> PresignedUpload:
-    """Return a presigned upload of the map that is completed or has not expired.
+    """Return a presigned upload of the map that is neither completed nor expired.
 
     Raises:
         NotFound: `upload_not_found`.
@@ -341,7 +339,7 @@ def get_presigned_upload(
             f"There is no upload {upload_id} in this map. Start one: POST /api/v1/uploads/presign.",
         )
     upload: PresignedUpload = row[0]
-    if row.expired and upload.response_body is None:
+    if row.expired:
         raise Gone(
             "upload_expired",
             f"The upload {upload_id} expired before it was completed. Start another one: POST "

@@ -70,11 +70,6 @@ class ServiceSettings(BaseSettings):
         description="port on HOST where a service answers GET /metrics for Prometheus, without a "
         "key; unset: no such port (the gateway and search also serve /metrics beside their API)",
     )
-    otel_exporter_otlp_endpoint: str | None = Field(
-        None,
-        description="OTLP/HTTP endpoint for traces: http://collector:4318; needs the extra otel; "
-        "unset: tracing is off",
-    )
     redis_url: SecretStr | None = Field(
         None,
         description="URL of the Redis that carries job notifications between services; unset: all "

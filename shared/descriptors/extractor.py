@@ -222,7 +222,11 @@ class Extractor:
 
         def to_rows(features: torch.Tensor) -> torch.Tensor:
             descriptors = self._aggregate(features, on_device)
-            return (descriptors if projection is None else projection(descriptors)).cpu()
+            rows = descriptors if projection is None else projection(descriptors)
+            host = rows.to("cpu", non_blocking=True)  # from a GPU into pinned memory
+            if rows.is_cuda:
+                torch.cuda.synchronize(rows.device)
+            return host
 
         rows = np.empty((len(photos), self.dimension(centres, projection)), np.float32)
         for indices, batch_rows in self._run_in_batches(photos, to_rows):

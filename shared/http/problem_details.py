@@ -20,7 +20,7 @@ from starlette.requests import ClientDisconnect
 from shared.catalog.database.errors import reason_of, to_unavailable
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable, shorten
 from shared.ids import new_id
-from shared.telemetry.tracing import REQUEST_ID_HEADER
+from shared.telemetry.request_ids import REQUEST_ID_HEADER
 
 log = logging.getLogger(__name__)
 

@@ -64,8 +64,8 @@ class DecodedPhoto:
     size: tuple[int, int] = (0, 0)
     """(width, height) of the upright photo."""
     detection_pixels: NDArray[np.uint8] | None = None
-    """(height, width, 3) RGB of the upright photo, its longer side at most WORKING_SIDE; None if
-    not requested."""
+    """(height, width, channels) of the upright photo, its longer side at most WORKING_SIDE: 3 for
+    RGB, 1 for its mean; None for 0"""
 
 
 def decode_photo(
@@ -74,7 +74,7 @@ def decode_photo(
     max_pixels: int,
     *,
     previews: Previews = Previews.NONE,
-    for_detection: bool = False,
+    detection_channels: int = 0,
 ) -> DecodedPhoto:
     """Decode and preprocess a photo, and make what else `DecodedPhoto` has of it.
 
@@ -106,8 +106,12 @@ def decode_photo(
             thumbnail = _small_jpeg(upright, THUMBNAIL_PIXELS, quality=85)
             preview = _small_jpeg(upright, PREVIEW_PIXELS, quality=80) if with_preview else None
             small = None
-            if for_detection:  # keypoints are found as well as in a bicubic copy, in half its time
-                small = np.asarray(_shrink(upright, WORKING_SIDE, Image.Resampling.BILINEAR))
+            if detection_channels:
+                if detection_channels == 1:  # one channel is shrunk in 2 ms, three in 5
+                    upright = upright.convert("L", (1 / 3, 1 / 3, 1 / 3, 0))
+                # Keypoints are found as well as in a bicubic copy, in half its time.
+                working = _shrink(upright, WORKING_SIDE, Image.Resampling.BILINEAR)
+                small = np.atleast_3d(np.asarray(working))
             return DecodedPhoto(pixels, thumbnail, preview, size, small)
     except UnidentifiedImageError as error:
         raise Unprocessable(
@@ -174,7 +178,7 @@ def to_rgb(image: Image.Image) -> Image.Image:
     if image.mode in ("I", "F"):
         raise ValueError(f"samples of mode {image.mode!r} have no defined brightness range")
     if not image.has_transparency_data:
-        return image.convert("RGB")
+        return image if image.mode == "RGB" else image.convert("RGB")
     # The colour under full transparency depends on the program that wrote the file; mostly black.
     rgba = image.convert("RGBA")
     on_black = Image.new("RGB", image.size)

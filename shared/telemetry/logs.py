@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from shared.config.settings import Settings
-from shared.telemetry.tracing import current_request_id, current_trace_id
+from shared.telemetry.request_ids import current_request_id
 
 TEXT_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 OWN_LOGGERS = ("lab", "services", "shared")
@@ -44,12 +44,11 @@ STANDARD_ATTRIBUTES = frozenset(logging.makeLogRecord({}).__dict__) | {
     "request_id",
     "service",
     "taskName",
-    "trace_id",
 }
 
 
 class _ContextFilter(logging.Filter):
-    """Adds the service name, the request id and the trace id to each record."""
+    """Adds the service name and the request id to each record."""
 
     def __init__(self, service: str) -> None:
         super().__init__()
@@ -60,16 +59,14 @@ class _ContextFilter(logging.Filter):
         # A record about another request than the current one has its id already.
         if not hasattr(record, "request_id"):
             record.request_id = current_request_id()
-        if not hasattr(record, "trace_id"):
-            record.trace_id = current_trace_id()
         return True
 
 
 class _JsonFormatter(logging.Formatter):
     """Formats a record as one JSON object per line.
 
-    Members: `time` (UTC), `level`, `logger`, `service`, `message`, `request_id` and `trace_id` if
-    set, `error` with a traceback, and the values passed as `extra`.
+    Members: `time` (UTC), `level`, `logger`, `service`, `message`, `request_id` if set, `error`
+    with a traceback, and the values passed as `extra`.
     """
 
     def format(self, record: logging.LogRecord) -> str:
@@ -80,9 +77,8 @@ class _JsonFormatter(logging.Formatter):
             "service": getattr(record, "service", None),
             "message": record.getMessage(),
         }
-        for name in ("request_id", "trace_id"):
-            if (value := getattr(record, name, None)) is not None:
-                line[name] = value
+        if (request_id := getattr(record, "request_id", None)) is not None:
+            line["request_id"] = request_id
         line |= _extra(record)
         if record.exc_info:
             line["error"] = self.formatException(record.exc_info)

@@ -11,7 +11,7 @@ import pytest
 
 from shared.config.settings import Settings
 from shared.telemetry.logs import configure_logging, forward_logs
-from shared.telemetry.tracing import request_id_context, request_id_or_new
+from shared.telemetry.request_ids import request_id_context, request_id_or_new
 
 Set = Callable[..., None]
 

@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import contextlib
 import glob
-import io
 import re
+import tempfile
 import unicodedata
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import BinaryIO
 
 from services.cli.ingest.local_headers import (
     dated_photo,
@@ -25,7 +24,7 @@ from services.cli.ingest.local_headers import (
     read_local_header,
     read_sidecar,
 )
-from services.cli.ingest.photo_archive import ArchivedFile, PhotoArchive, is_archive
+from services.cli.ingest.photo_archive import is_archive, unpack_archive
 from services.cli.output import Json, utf8_path
 from shared.errors import InvalidRequest, PlacewiseError
 from shared.geotagging.evidence import add_time_zones
@@ -45,30 +44,17 @@ HEADER_FIELDS = ("latitude", "longitude", "altitude", "heading", "captured_at")
 
 @dataclass(frozen=True, slots=True)
 class LocalPhoto:
-    """A photo file, or a photo in an archive, with the metadata that is uploaded with it."""
+    """A photo file with the metadata that is uploaded with it."""
 
     path: Path
-    """Of a photo in an archive: the archive's path and the photo's name in it."""
     fields: dict[str, str]
     """Form fields of `POST /upload`."""
     name: str | None = None
     """Name to store; None for the file's own name."""
     relative_path: str | None = None
-    """Path in the folder or archive that is indexed."""
-    archived: ArchivedFile | None = None
-    """The photo in its archive."""
+    """Path in the folder that is indexed."""
     sidecars: Mapping[str, bytes] = field(default_factory=dict)
     """XMP by path"""
-
-    def open(self) -> BinaryIO:
-        """Open the photo. Raises OSError, and what `ArchivedFile.read` raises."""
-        if self.archived is None:
-            return self.path.open("rb")
-        return io.BytesIO(self.archived.read())
-
-    def content(self) -> Path | BinaryIO:
-        """Return the file, or open what is not a file of its own. Raises what `open` raises."""
-        return self.path if self.archived is None else self.open()
 
 
 def find_local_sources(sources: Sequence[str]) -> list[Path] | None:
@@ -92,41 +78,52 @@ def _is_photo(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in PHOTO_SUFFIXES
 
 
-def open_local_source(path: Path, stack: contextlib.ExitStack) -> Path | PhotoArchive:
-    """Open the path if it is an archive, which the stack closes; else return it."""
-    if path.is_dir() or _is_photo(path):
-        return path
-    return stack.enter_context(PhotoArchive(path))
+@dataclass(frozen=True, slots=True)
+class LocalSource:
+    """A folder or a photo."""
+
+    path: Path
+    table: Path | None = None
+    """An archive's own table; its names are relative to its folder."""
+
+    @classmethod
+    def open(cls, path: Path, stack: contextlib.ExitStack) -> LocalSource:
+        """Unpack an archive into a temporary folder, which the stack deletes."""
+        if path.is_dir() or _is_photo(path):
+            return cls(path)
+        scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="placewise-"))
+        folder = Path(scratch, path.name)
+        folder.mkdir()
+        return cls(folder, unpack_archive(path, folder))
 
 
-def count_other_files(source: Path | PhotoArchive) -> Counter[str]:
-    """Count the files of a folder or archive that are no photos by their suffix, such as `.mov`.
+def count_other_files(folder: Path) -> Counter[str]:
+    """Count the files of a folder that are no photos by their suffix, such as `.mov`.
 
     Hidden files are left out.
     """
-    if isinstance(source, PhotoArchive):
-        return source.other_files
     return Counter(
         path.suffix.lower()
-        for path in source.rglob("*")
+        for path in folder.rglob("*")
         if path.suffix.lower() not in PHOTO_SUFFIXES
-        and not _is_hidden(path, source)
+        and not _is_hidden(path, folder)
         and path.is_file()
     )
 
 
 def find_photos(
-    source: Path | PhotoArchive,
+    source: Path,
     table: Path | None,
     utm_zone: str | None,
     *,
+    own_table: Path | None = None,
     places_by_folder: bool = False,
 ) -> list[LocalPhoto]:
-    """Find the photos below a folder, sorted by path, of an archive, or one photo.
+    """Find the photos below a folder, sorted by path, or one photo.
 
     Args:
-        source: A photo, a folder, which is searched recursively, or an open archive, of which the
-            own table is read as well.
+        source: A photo, or a folder, which is searched recursively.
+        own_table: CSV file or JSONL manifest in the folder, with names relative to its own folder.
         table: CSV file with metadata; it takes precedence over names of files and folders.
         utm_zone: Zone for `@UTM@` file names that don't contain it, such as `32T`.
         places_by_folder: Use the name of a photo's parent folder as its place label. Photos
@@ -136,32 +133,24 @@ def find_photos(
         InvalidRequest: The table refers to a photo that does not exist, or contains coordinates
             that can't be parsed; `no_photos` if the folder contains none.
     """
-    found: list[tuple[Path, ArchivedFile | None]]
-    table_fields: dict[Path, dict[str, str]] = {}
-    if isinstance(source, PhotoArchive):
-        folder = source.path
-        found = [(folder / photo.name, photo) for photo in source.photos]
-        table_fields = {folder / name: fields for name, fields in source.table_fields().items()}
-    else:
-        folder = source if source.is_dir() else source.parent
-        found = [(path, None) for path in ([source] if source != folder else list_photos(folder))]
+    folder = source if source.is_dir() else source.parent
+    found = [source] if source != folder else list_photos(folder)
+    own_fields, table_fields = {}, {}
+    if own_table is not None:
+        own_fields = _read_table(own_table.parent, own_table, set(found))
     if table is not None:
-        csv_fields = _read_csv_fields(folder, table, {path for path, _ in found})
-        table_fields |= {p: {**table_fields.get(p, {}), **csv_fields[p]} for p in csv_fields}
+        table_fields = _read_table(folder, table, set(found))
     photos = []
-    for path, archived in found:
+    for path in found:
         fields = upload_fields_of_file_name(path.name, utm_zone)
         if places_by_folder and path.parent != folder:
             fields["place"] = path.parent.name
         photos.append(
             LocalPhoto(
                 path,
-                {**fields, **table_fields.get(path, {})},
+                {**fields, **own_fields.get(path, {}), **table_fields.get(path, {})},
                 relative_path=utf8_path(path.relative_to(folder)),
-                archived=archived,
-                sidecars={utf8_path(each): read_sidecar(each) for each in find_sidecars(path)}
-                if archived is None
-                else archived.read_sidecars(),
+                sidecars={utf8_path(each): read_sidecar(each) for each in find_sidecars(path)},
             )
         )
     return photos
@@ -193,7 +182,7 @@ def add_local_headers(
     headers = []
     for photo in photos:
         try:
-            with photo.open() as file:
+            with photo.path.open("rb") as file:
                 own = read_local_header(file)
                 whole = read_local_header(file, photo.sidecars.values()) if photo.sidecars else own
         except (OSError, PlacewiseError):
@@ -282,13 +271,14 @@ def list_photos(folder: Path) -> list[Path]:
     return paths
 
 
-def _read_csv_fields(folder: Path, table: Path, paths: set[Path]) -> dict[Path, dict[str, str]]:
+def _read_table(folder: Path, table: Path, paths: set[Path]) -> dict[Path, dict[str, str]]:
     try:
         data = table.read_bytes()
     except OSError as error:
         raise InvalidRequest("bad_table", f"Can't read {table}: {error}") from error
+    read = read_jsonl_manifest if table.suffix == ".jsonl" else read_csv_manifest
     fields = {}
-    for row in read_csv_manifest(data, str(table)):
+    for row in read(data, str(table)):
         path = next((path for path in _possible_paths(folder, row.name) if path in paths), None)
         if path is None:
             raise bad_lines_error(

@@ -19,14 +19,13 @@ from services.cli.client import client_command, connect, describe_target
 from services.cli.ingest.anyloc import read_anyloc_photos
 from services.cli.ingest.geotags import (
     LocalPhoto,
+    LocalSource,
     add_local_headers,
     count_other_files,
     find_local_sources,
     find_photos,
-    open_local_source,
     read_photo_manifest,
 )
-from services.cli.ingest.photo_archive import PhotoArchive
 from services.cli.ingest.upload import (
     NoFitOption,
     UpdateOption,
@@ -130,7 +129,7 @@ def index(
     photos: list[LocalPhoto] = []
     batch: Callable[[Client], BatchStarted] | None = None  # of objects that the server has
     with contextlib.ExitStack() as stack:
-        opened: list[Path | PhotoArchive] = []
+        opened: list[LocalSource] = []
         about_sources: Json = {}
         local = find_local_sources(sources)
         if anyloc is not None:
@@ -143,9 +142,11 @@ def index(
         elif local is not None:
             if len(local) > 1 or path.suffix.lower() in PHOTO_SUFFIXES:
                 _reject_options("photos and several folders", {"--csv": table})
-            opened = [open_local_source(each, stack) for each in local]
+            opened = [LocalSource.open(each, stack) for each in local]
             for each in opened:
-                photos += find_photos(each, table, utm_zone, places_by_folder=places)
+                photos += find_photos(
+                    each.path, table, utm_zone, own_table=each.table, places_by_folder=places
+                )
             if role != PhotoRole.DATABASE:
                 photos = [replace(p, fields={**p.fields, "role": role}) for p in photos]
         elif len(sources) > 1:
@@ -177,9 +178,9 @@ def index(
         if photos and anyloc is None:
             photos, headers = add_local_headers(photos, time_zone)
             sidecars = len({path for photo in photos for path in photo.sidecars})
-            others = sum(map(count_other_files, opened), Counter[str]()) - Counter(
-                {".xmp": sidecars}
-            )
+            read = Counter(each.table.suffix for each in opened if each.table)
+            read[".xmp"] = sidecars
+            others = sum((count_other_files(each.path) for each in opened), Counter[str]()) - read
             about_sources = {
                 "other_files": others.total(),
                 "other_suffixes": dict(others.most_common()),

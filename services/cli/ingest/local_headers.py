@@ -17,18 +17,14 @@ from shared.geotagging.evidence import Dated, DatedPhoto
 from shared.imaging.bounded_reader import MAX_METADATA_BYTES
 from shared.imaging.photo_header import PhotoHeader, read_photo_header
 
-SIDECAR_SUFFIX = ".xmp"
-
-
-def sidecar_names(name: str) -> tuple[str, ...]:
-    """Return the names that a photo's sidecar may have: `IMG_1.jpg.xmp`, or else `IMG_1.xmp`."""
-    stems = (name, os.path.splitext(name)[0])  # noqa: PTH122 names in archives, too
-    return tuple(stem + suffix for stem in stems for suffix in (SIDECAR_SUFFIX, ".XMP"))
-
 
 def find_sidecars(photo: Path) -> list[Path]:
-    """Return the sidecars of a photo that exist, in the order of `sidecar_names`."""
-    paths = (photo.with_name(name) for name in sidecar_names(photo.name))
+    """Return the sidecars of a photo that exist: `IMG_1.jpg.xmp`, then `IMG_1.xmp`."""
+    paths = (
+        photo.with_name(name + suffix)
+        for name in (photo.name, photo.stem)
+        for suffix in (".xmp", ".XMP")
+    )
     return [path for path in paths if os.path.isfile(path)]  # noqa: PTH113 any length
 
 

@@ -13,8 +13,7 @@ from collections import Counter, deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any
 from uuid import UUID
 
 import typer
@@ -160,10 +159,10 @@ def wait_for_automatic_fit(client: Client, progress: Progress) -> Job | None:
 def _upload_concurrently(
     client: Client, photos: list[LocalPhoto], update: bool
 ) -> Iterator[tuple[LocalPhoto, Uploaded | PlacewiseError]]:
-    def upload(photo: LocalPhoto, content: Path | BinaryIO) -> Uploaded | PlacewiseError:
+    def upload(photo: LocalPhoto) -> Uploaded | PlacewiseError:
         fields: dict[str, Any] = {"relative_path": photo.relative_path, **photo.fields}
         name = photo.name or printable_name(photo.path)
-        send = partial(client.upload, content, filename=name, **fields)
+        send = partial(client.upload, photo.path, filename=name, **fields)
         try:
             try:
                 return send()
@@ -177,14 +176,8 @@ def _upload_concurrently(
 
     started: deque[tuple[LocalPhoto, Future[Uploaded | PlacewiseError]]] = deque()
     with ThreadPoolExecutor(UPLOAD_CONCURRENCY) as pool:
-        for photo in photos:
-            try:
-                # In the order of the archive, and only a few ahead: they are read into memory.
-                content = photo.content()
-            except PlacewiseError as error:
-                yield photo, error
-                continue
-            started.append((photo, pool.submit(upload, photo, content)))
+        for photo in photos:  # only a few ahead, which an interrupt waits for
+            started.append((photo, pool.submit(upload, photo)))
             if len(started) == UPLOADS_AHEAD:
                 first, future = started.popleft()
                 yield first, future.result()

@@ -21,7 +21,6 @@ from shared.catalog.tables import open_catalog
 from shared.config.private_files import is_open_to_others
 from shared.config.settings import Settings, memory_limit_bytes
 from shared.errors import Misconfigured
-from shared.telemetry.tracing import configure_tracing
 
 BYTES_PER_PARAMETER = 4  # float32
 # Twice the memory measured in the forward pass of ViT-g, the widest backbone, at 224 x 224 pixels:
@@ -154,9 +153,8 @@ def _check_versions(_: Settings) -> str:
 
 
 def _check_settings(settings: Settings) -> str:
-    """Report the settings, which are valid, or no check would run; Misconfigured as for tracing."""
-    with configure_tracing(settings, "doctor"):
-        return f"{len(settings.model_fields_set)} settings are set (placewise config lists all)"
+    """Report the settings, which are valid, or no check would run."""
+    return f"{len(settings.model_fields_set)} settings are set (placewise config lists all)"
 
 
 def _check_home(settings: Settings) -> str:

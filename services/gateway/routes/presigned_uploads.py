@@ -12,7 +12,6 @@ copy is validated, described and acknowledged.
 from __future__ import annotations
 
 import contextlib
-import json
 from datetime import datetime
 from typing import Annotated, Any
 from uuid import UUID
@@ -37,8 +36,8 @@ from services.gateway.dependencies import (
     MapQuery,
     UploadId,
 )
-from services.gateway.idempotency import IdempotentDep, IdempotentReplay, delete_if_refused
-from services.gateway.responses import accepted_headers, url_in_map
+from services.gateway.idempotency import IdempotentDep, IdempotentRequest, delete_if_refused
+from services.gateway.responses import url_in_map
 from services.gateway.routes.photos import PhotoUpdate
 from services.gateway.routes.uploads import (
     UPLOAD_RESPONSES,
@@ -49,7 +48,7 @@ from services.gateway.routes.uploads import (
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.maps import get_map
 from shared.catalog.photos import PresignedUpload, get_presigned_upload
-from shared.errors import Conflict, NotFound, Unavailable, Unprocessable
+from shared.errors import Conflict, NotFound, PlacewiseError, Unavailable, Unprocessable
 from shared.ids import new_id
 from shared.ingest.photo_metadata import PhotoFields, coordinate_pair
 from shared.ingest.store_photo import StoreResult, insert_photo
@@ -169,56 +168,67 @@ async def complete_presigned_upload(
 
     The responses are those of `POST /upload`. A repeated request gets the same response again.
     """
+    # Executed once, as a request with an Idempotency-Key is.
+    idempotent = IdempotentRequest(gateway, request, response, f"upload-{upload_id}")
     with admission.admit_upload(UploadKind.UPLOAD, request):
-        stored = await run_in_threadpool(_complete_upload, request, gateway, query.map, upload_id)
+        stored = await run_in_threadpool(
+            _complete_upload, request, gateway, query.map, upload_id, idempotent
+        )
     job = await wait_for_description(request, response, gateway, stored)
     outcome = UploadOutcome.of(stored, job, query.map)
     if outcome.status == 201:
-        await run_in_threadpool(_replace_response, gateway, upload_id, outcome)
+        await run_in_threadpool(
+            idempotent.replace_response, outcome.status, outcome.body, outcome.headers
+        )
     return outcome.send(response)
 
 
 def _complete_upload(
-    request: Request, gateway: GatewayContext, map_name: str, upload_id: UUID
+    request: Request,
+    gateway: GatewayContext,
+    map_name: str,
+    upload_id: UUID,
+    idempotent: IdempotentRequest,
 ) -> StoreResult:
-    """Copy the object, validate the copy and store the photo.
-
-    Raises:
-        IdempotentReplay: The upload was completed before.
-    """
+    """Copy the object, validate the copy and store the photo, unless that was done before."""
     store = _require_presigning_store(gateway)
+    idempotent.begin(None)
+    try:
+        stored = _store_copy(request, gateway, store, map_name, upload_id, idempotent)
+    except PlacewiseError:
+        idempotent.replay_if_executed()  # by a request at the same time
+        raise
+    finish_upload(gateway, stored, map_name)
+    # The photo is acknowledged already; garbage collection deletes the object if this fails.
+    with contextlib.suppress(Unavailable):
+        store.delete(incoming_key(upload_id))
+    return stored
+
+
+def _store_copy(
+    request: Request,
+    gateway: GatewayContext,
+    store: PresigningStore,
+    map_name: str,
+    upload_id: UUID,
+    idempotent: IdempotentRequest,
+) -> StoreResult:
     with gateway.catalog.read() as session:
         upload = get_presigned_upload(session, get_map(session, map_name).id, upload_id)
-    _replay_if_completed(upload)
     source_key, key = incoming_key(upload_id), new_original_key()
     try:
         _check_object_size(store.head(source_key), upload)
         store.copy(source_key, key)
     except NotFound:
-        # Not sent yet, or already deleted by a concurrent request that has completed the upload.
-        with gateway.catalog.read() as session:
-            _replay_if_completed(get_presigned_upload(session, upload.map_id, upload_id))
         raise _upload_incomplete_error(upload) from None
     with delete_if_refused(store, key):
         photo = _validate_copy(request, gateway, store, key, upload)
         with reserve_photo_quota(request, gateway.settings), gateway.catalog.write() as session:
             stored = insert_photo(session, map_name, photo)
-            locked = get_presigned_upload(session, upload.map_id, upload_id, lock=True)
-            _replay_if_completed(locked)
+            session.delete(get_presigned_upload(session, upload.map_id, upload_id, lock=True))
             outcome = UploadOutcome.of(stored, stored.job, map_name)
-            locked.status, locked.response_body = outcome.status, outcome.body.model_dump_json()
-    finish_upload(gateway, stored, map_name)
-    # The photo is acknowledged already; garbage collection deletes the object if this fails.
-    with contextlib.suppress(Unavailable):
-        store.delete(source_key)
+            idempotent.store_response(session, outcome.status, outcome.body, outcome.headers)
     return stored
-
-
-def _replace_response(gateway: GatewayContext, upload_id: UUID, outcome: UploadOutcome) -> None:
-    with gateway.catalog.write() as session:
-        upload = session.get(PresignedUpload, upload_id)
-        if upload is not None:  # its map may have been deleted during the wait
-            upload.status, upload.response_body = outcome.status, outcome.body.model_dump_json()
 
 
 def _validate_copy(
@@ -263,15 +273,6 @@ def _upload_incomplete_error(upload: PresignedUpload) -> Conflict:
         "upload_incomplete",
         f"No file was sent for the upload {upload.id} yet. PUT it to the URL of the upload first.",
     )
-
-
-def _replay_if_completed(upload: PresignedUpload) -> None:
-    if upload.response_body is None:
-        return
-    assert upload.status is not None
-    status_url = json.loads(upload.response_body)["status_url"]
-    headers = accepted_headers(status_url) if upload.status == 202 else {"Location": status_url}
-    raise IdempotentReplay(upload.status, headers, upload.response_body)
 
 
 def _parse_photo_fields(values: dict[str, Any]) -> PhotoFields:

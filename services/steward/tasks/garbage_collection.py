@@ -48,7 +48,6 @@ T = TypeVar("T")
 SUPERSEDED_GRACE_SECONDS = 600.0  # search reads a merged chunk until it has loaded the new one
 RETIRED_GRACE_SECONDS = 3600.0  # the same of a replaced generation, and time to switch back
 ROWS_PER_TRANSACTION = 500  # rows handled in one transaction
-COMPLETED_UPLOAD_SECONDS = 86_400.0  # retention of a completed presigned upload
 # A full object store accepts no journal segment, and only deletions free space. A photo that is
 # deleted before the journal records it does not come back either: without its original it is not
 # rebuilt.
@@ -305,16 +304,8 @@ def delete_presigned_uploads(catalog: Catalog, store: ObjectStore, condition: Co
 
 
 def collect_presigned_uploads(catalog: Catalog, store: ObjectStore) -> None:
-    """Delete presigned uploads that expired.
-
-    Completed ones stay COMPLETED_UPLOAD_SECONDS longer: until then, completing one again returns
-    the same response.
-    """
-    expired = or_(
-        and_(PresignedUpload.response_body.is_(None), PresignedUpload.expires_at < db_now()),
-        PresignedUpload.expires_at < db_now_plus(-COMPLETED_UPLOAD_SECONDS),
-    )
-    delete_presigned_uploads(catalog, store, expired)
+    """Delete presigned uploads that expired."""
+    delete_presigned_uploads(catalog, store, PresignedUpload.expires_at < db_now())
 
 
 def collect_checkpoints(catalog: Catalog, store: ObjectStore) -> None:

@@ -216,11 +216,7 @@ def _referenced_incoming(session: Session, keys: list[str]) -> Iterable[str]:
     An object of a completed upload was sent again while its URL was still valid.
     """
     upload_ids = _parse_uuids(key.removeprefix(INCOMING) for key in keys)
-    waiting = session.scalars(
-        select(PresignedUpload.id).where(
-            PresignedUpload.id.in_(upload_ids), PresignedUpload.response_body.is_(None)
-        )
-    )
+    waiting = session.scalars(select(PresignedUpload.id).where(PresignedUpload.id.in_(upload_ids)))
     return [incoming_key(upload_id) for upload_id in waiting]
 
 

@@ -90,7 +90,7 @@ def test_the_jobs_of_a_crashed_batch_are_retried_alone_until_the_cause_fails(
     good, bad = queue(catalog, JobKind.INDEX, 2)
     claimed = recorder.runner.claim(limit=2)
     assert claimed is not None
-    with claimed.lease, recorder.runner.step(claimed, "describe"):
+    with claimed.lease, recorder.runner.step(claimed):
         raise RuntimeError("one of the two photos")
     assert recorder.outcomes == [(JobKind.INDEX, StepOutcome.CRASHED, 2)]
     assert all(read_job(catalog, job_id).alone for job_id in (good, bad))

@@ -16,7 +16,7 @@ from sqlalchemy import func, select
 
 from services.extractor import describe, fits
 from services.extractor.generation_resolver import resolve_generation
-from services.extractor.worker import QUERY_POLL_SECONDS, ExtractorWorker
+from services.extractor.worker import ExtractorWorker
 from services.steward.tasks import auto_fit
 from services.steward.tasks.auto_fit import fit_due_vocabularies
 from shared.catalog.chunks import Chunk, list_live_chunks
@@ -28,6 +28,7 @@ from shared.descriptors.extractor import Extractor
 from shared.descriptors.vocabulary import decode_centres
 from shared.imaging.preprocessing import Pixels
 from shared.jobs import JobKind, JobState
+from shared.jobs.runner import IDLE_POLL_SECONDS
 from shared.storage.chunks import decode_rows, manifest_key
 from shared.storage.keys import query_vector_key, thumbnail_key
 from tests.integration.extractor.conftest import Hook
@@ -122,9 +123,7 @@ def test_two_workers_at_once_describe_each_photo_once(
 
 @pytest.mark.databases("sqlite", "postgresql")
 def test_two_workers_create_one_first_generation_of_a_map(
-    averages: Harness,
-    make_worker: Callable[[], ExtractorWorker],
-    monkeypatch: pytest.MonkeyPatch,
+    averages: Harness, make_worker: Callable[[], ExtractorWorker], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (other,) = averages.upload(1)
     first, second = make_worker(), make_worker()
@@ -211,7 +210,7 @@ def test_no_query_is_described_beside_a_job_marked_alone(
     def ask(_: NDArray[np.uint8]) -> None:
         if not queries:
             queries.append(averages.ask(photo_bytes(99)))
-            time.sleep(3 * QUERY_POLL_SECONDS)
+            time.sleep(2 * IDLE_POLL_SECONDS)
             during.append(JobState(averages.job(queries[0]).state))
 
     before_describing(ask)
@@ -243,9 +242,7 @@ def test_queries_and_photos_are_described_while_a_vocabulary_is_fitted(
 
 
 @pytest.mark.usefixtures("fit_at_four_photos")
-def test_photos_wait_for_a_vocabulary_which_is_fitted_once_there_are_enough(
-    vlads: Harness,
-) -> None:
+def test_photos_wait_for_a_vocabulary_which_is_fitted_once_there_are_enough(vlads: Harness) -> None:
     photo_ids = vlads.upload(1, 2, 3)
     query = vlads.ask(photo_bytes(9))
     vlads.drain()
@@ -340,9 +337,7 @@ def test_no_vocabulary_is_fitted_where_it_is_switched_off_or_none_is_used(
 
 
 def test_a_photo_that_finds_no_vocabulary_while_one_is_made_is_not_left_waiting(
-    vlads: Harness,
-    make_worker: Callable[[], ExtractorWorker],
-    monkeypatch: pytest.MonkeyPatch,
+    vlads: Harness, make_worker: Callable[[], ExtractorWorker], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vlads.upload(1, 2)
     slow, quick = make_worker(), make_worker()

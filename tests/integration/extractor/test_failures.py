@@ -93,9 +93,7 @@ def test_a_descriptor_that_is_not_finite_is_refused_and_harms_no_other(
 
 
 def test_a_crash_between_chunk_and_commit_leaves_an_orphan_that_is_collected(
-    averages: Harness,
-    make_worker: Callable[[], ExtractorWorker],
-    monkeypatch: pytest.MonkeyPatch,
+    averages: Harness, make_worker: Callable[[], ExtractorWorker], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Killed(BaseException):
         """Nothing in the worker may catch this, as nothing catches SIGKILL."""
@@ -163,9 +161,7 @@ def test_leases_end_when_the_catalog_becomes_unreachable_during_a_drain(
 
 
 def test_nothing_of_a_batch_is_committed_once_its_lease_was_taken_over(
-    averages: Harness,
-    make_worker: Callable[[], ExtractorWorker],
-    before_describing: Hook,
+    averages: Harness, make_worker: Callable[[], ExtractorWorker], before_describing: Hook
 ) -> None:
     photo_ids = averages.upload(1, 2, 3)
     slow, quick = make_worker(), make_worker()

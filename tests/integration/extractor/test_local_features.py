@@ -29,6 +29,8 @@ from tests.integration.harness import Harness
 from tests.support.catalog_rows import read_job, set_columns
 from tests.support.photos import encoded, photo_bytes, turned_photo
 
+TO_GEM = {"vocabulary_id": None, "extractor": "test-tiny-vlad:aggregator=gem"}
+
 
 def textured(number: int, size: tuple[int, int] = (400, 300)) -> Image.Image:
     """A photo full of corners: random blocks of 8 pixels."""
@@ -107,9 +109,7 @@ def test_photos_get_features_in_pixels_of_the_upright_photo(harness: Harness) ->
     np.testing.assert_allclose(*points, atol=0.5)
 
 
-def test_shifted_copy_of_a_photo_matches_it_and_another_photo_does_not(
-    harness: Harness,
-) -> None:
+def test_shifted_copy_of_a_photo_matches_it_and_another_photo_does_not(harness: Harness) -> None:
     scene = textured(1, (800, 600))
     views = [scene.crop((x, 0, x + 640, 600)) for x in (0, 80)]
     photos = [harness.upload_bytes(encoded(view, "JPEG"))[0] for view in (*views, textured(2))]
@@ -132,7 +132,7 @@ def test_photo_of_8_pixels_and_one_without_texture_have_features_without_keypoin
     harness: Harness,
 ) -> None:
     tiny, _ = harness.upload_bytes(encoded(Image.new("RGB", (8, 8), "red"), "PNG"))
-    flat, _ = harness.upload_bytes(encoded(Image.new("RGB", (640, 480), "grey"), "PNG"))
+    flat, _ = harness.upload_bytes(encoded(Image.new("RGB", (640, 480), "red"), "PNG"))
     harness.drain()
     assert keypoints(harness) == {tiny: 0, flat: 0}
     assert harness.searchable() == 2
@@ -168,11 +168,7 @@ def test_features_of_photos_are_computed_as_the_map_says_and_as_an_evaluation_de
     ],
 )
 def test_query_gets_features_where_its_search_matches_it(
-    harness: Harness,
-    matching: Matching,
-    uses_matches: bool,
-    params: dict[str, Any],
-    expected: bool,
+    harness: Harness, matching: Matching, uses_matches: bool, params: dict[str, Any], expected: bool
 ) -> None:
     harness.upload_bytes(photo_bytes(1))
     harness.drain()
@@ -244,9 +240,7 @@ def test_on_resumes_after_a_kill_with_what_is_missing(
     assert all(keypoints(harness).values())
 
 
-def test_photo_whose_original_is_lost_keeps_its_row_and_has_no_features(
-    harness: Harness,
-) -> None:
+def test_photo_whose_original_is_lost_keeps_its_row_and_has_no_features(harness: Harness) -> None:
     set_matching(harness, Matching.OFF)
     lost, kept = (harness.upload_bytes(texture_bytes(number))[0] for number in range(2))
     harness.drain()
@@ -279,9 +273,7 @@ def test_model_change_copies_the_features_of_the_active_generation(
     if change == "pca":
         job_id = harness.start(JobKind.PCA, pca=2)
     else:
-        job_id = harness.start(
-            JobKind.SWITCH, vocabulary_id=None, extractor="test-tiny-vlad:aggregator=gem"
-        )
+        job_id = harness.start(JobKind.SWITCH, **TO_GEM)
     assert harness.finish(job_id).state == JobState.SUCCEEDED
     assert not detected
     after = features_of(harness)
@@ -299,9 +291,7 @@ def test_damaged_features_are_computed_again_by_a_model_change(harness: Harness)
     (key,) = (key for key in harness.keys("chunks/") if key.endswith(".features"))
     data = harness.store.get(key)
     harness.store.put(key, data[:-7])
-    job_id = harness.start(
-        JobKind.SWITCH, vocabulary_id=None, extractor="test-tiny-vlad:aggregator=gem"
-    )
+    job_id = harness.start(JobKind.SWITCH, **TO_GEM)
     assert harness.finish(job_id).state == JobState.SUCCEEDED
     assert all(keypoints(harness).values())
 
@@ -312,17 +302,13 @@ def test_generation_of_a_map_that_gains_nothing_by_matches_gets_no_features(
     harness.upload_bytes(texture_bytes(1))
     harness.drain()
     decide(harness, uses_matches=False)
-    job_id = harness.start(
-        JobKind.SWITCH, vocabulary_id=None, extractor="test-tiny-vlad:aggregator=gem"
-    )
+    job_id = harness.start(JobKind.SWITCH, **TO_GEM)
     assert harness.finish(job_id).state == JobState.SUCCEEDED
     assert harness.active().uses_matches is False
     assert set(keypoints(harness).values()) == {None}
 
 
-def test_unknown_detector_of_a_map_stops_its_photos_and_not_its_queries(
-    harness: Harness,
-) -> None:
+def test_unknown_detector_of_a_map_stops_its_photos_and_not_its_queries(harness: Harness) -> None:
     harness.upload_bytes(photo_bytes(1))
     harness.drain()
     decide(harness, uses_matches=True)

@@ -216,14 +216,11 @@ def done(catalog: Catalog) -> dict[str, int]:
 
 
 def test_a_thread_that_redis_does_not_answer_is_stuck_unless_redis_answers_nobody(
-    wakeups: CeleryJobMessages,
-    app: Celery,
-    own_redis: RedisServer,
-    monkeypatch: pytest.MonkeyPatch,
+    wakeups: CeleryJobMessages, app: Celery, own_redis: RedisServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(celery_node, "STUCK_SECONDS", 3.0)
     settings = Settings(redis_url=own_redis.url)
-    node = CeleryNode(app, settings, "extractor-1@here", wakeups, dict)
+    node = CeleryNode(app, settings, "extractor-1@here", wakeups, dict, list)
     hang, stop = threading.Event(), threading.Event()
     receive = node._receive_messages
 

@@ -1,16 +1,14 @@
-"""One id from a call through its jobs to a chunk: in answers, logs, the catalog, traces."""
+"""One id from a call through its jobs to a chunk: in answers, logs, the catalog and search."""
 
 from __future__ import annotations
 
 import logging
-import sys
 import threading
 from collections.abc import Iterator
-from uuid import UUID
 
+import httpx2
 import pytest
-from opentelemetry.sdk.trace import ReadableSpan
-from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
+from opentelemetry.trace import NonRecordingSpan, SpanContext, TraceFlags, use_span
 from sqlalchemy import select
 
 from services.steward.batches.worker import BatchWorker
@@ -18,10 +16,11 @@ from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk
 from shared.catalog.jobs import Job, JobKind
 from shared.config.settings import Settings
-from shared.errors import Misconfigured
 from shared.jobs import InProcessWakeups
-from shared.telemetry.tracing import configure_tracing
+from shared.search_api.client import _call
+from shared.telemetry.request_ids import request_id_context
 from tests.integration.in_process_api import Service
+from tests.support.fake_server import running_server
 from tests.support.photos import photo_bytes
 
 ID = "from-the-proxy-17"
@@ -77,51 +76,14 @@ def test_photos_of_a_batch_carry_the_id_of_its_call(service: Service) -> None:
     assert sorted(made) == [(JobKind.BATCH, ID), (JobKind.INDEX, ID), (JobKind.INDEX, ID)]
 
 
-def test_a_trace_leads_from_the_call_to_the_transaction_that_makes_it_searchable(
-    service: Service,
-) -> None:
-    spans = InMemorySpanExporter()
-    caller = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
-    with configure_tracing(Settings(), "test", spans):
-        answer = service(
-            "POST",
-            "/upload",
-            files={"file": ("a.jpg", photo_bytes(1))},
-            headers={"traceparent": caller, "X-Request-ID": ID},
-        )
-        service.upload(photo_bytes(2))
-        service.drain()
-        job_id = UUID(answer.json()["job_id"])
-        with service.catalog.read() as session:
-            stored = session.get_one(Job, job_id).traceparent
-    done = {span.name: span for span in spans.get_finished_spans()}
-    call = next(
-        span
-        for span in spans.get_finished_spans()
-        if span.name == "POST /api/v1/upload" and _attribute(span, "request_id") == ID
+def test_the_id_and_the_trace_of_a_call_go_on_to_search() -> None:
+    caller = SpanContext(
+        0x0AF7651916CD43DD8448EB211C80319C, 0xB7AD6B7169203331, False, TraceFlags(1)
     )
-    assert f"{call.context.trace_id:032x}" == caller.split("-")[1]
-    assert call.parent is not None
-    assert f"{call.parent.span_id:016x}" == caller.split("-")[2]
-    assert _attribute(call, "status") == 202
-    assert stored == f"00-{call.context.trace_id:032x}-{call.context.span_id:016x}-01"
-    for step in ("prepare", "describe", "publish"):
-        # A batch of two requests' jobs: linked to both.
-        assert call.context.span_id in {link.context.span_id for link in done[step].links}, step
-        assert _attribute(done[step], "jobs") == 2
-    assert service.upload(photo_bytes(3))["job_id"], "and without traces all goes on"
-
-
-def test_traces_without_their_packages_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", "http://127.0.0.1:4318")
-    monkeypatch.setitem(sys.modules, "opentelemetry.sdk.trace", None)
-    with (
-        pytest.raises(Misconfigured, match="extra `otel`") as caught,
-        configure_tracing(Settings(), "gateway"),
-    ):
-        pass
-    assert caught.value.code == "otel_missing"
-
-
-def _attribute(span: ReadableSpan, name: str) -> object:
-    return (span.attributes or {}).get(name)
+    with running_server() as server, httpx2.Client() as http:
+        server.will_answer(200, {})
+        with request_id_context(ID), use_span(NonRecordingSpan(caller)):
+            _call(http, "GET", server.url, 30)
+        (headers,) = server.headers
+    assert headers["X-Request-ID"] == ID
+    assert headers["traceparent"] == "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
