@@ -196,7 +196,7 @@ class SearchWorker:
         """Create the worker of SEARCH_ENGINE."""
         if settings.search_engine == "milvus":
             try:
-                from services.search.milvus import MilvusWorker
+                from services.search.milvus.worker import MilvusWorker
             except ImportError as error:
                 detail = "SEARCH_ENGINE=milvus needs the extra milvus: pip install pymilvus."
                 raise Misconfigured("no_milvus", detail) from error

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from pydantic import SecretStr
 
-from services.search import milvus as milvus_module
-from services.search.milvus import MilvusWorker
+from services.search.milvus import worker as milvus_module
+from services.search.milvus.worker import MilvusWorker
 from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Unavailable

@@ -15,9 +15,10 @@ from hypothesis import settings as how
 from hypothesis import strategies as some
 from pydantic import SecretStr
 
-from services.search import milvus as milvus_module
-from services.search.milvus import MilvusWorker
-from services.search.milvus_filters import filter_columns, filter_expression
+from services.search.milvus import worker as milvus_module
+from services.search.milvus.collection import Collection
+from services.search.milvus.filters import filter_columns, filter_expression
+from services.search.milvus.worker import MilvusWorker
 from services.search.worker import SearchWorker
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
@@ -195,7 +196,7 @@ class MilvusContract(AnswersContract):
     ) -> None:
         places.add(unit_rows(1, 5))
         complete(worker)
-        worker._create_collection("placewise_of_others_1_FLAT", 4, 1)
+        Collection(worker.client, "placewise_of_others_1_FLAT").create(4, 1)
         with places.catalog.write() as session:
             session.get_one(Generation, places.generation_id).state = GenerationState.RETIRED
         worker.sync()
@@ -288,8 +289,9 @@ VECTOR = np.eye(1, 4, dtype=np.float32)[0]
 
 
 def found_by(worker: MilvusWorker, condition: str, circle: Circle | None) -> set[UUID]:
-    worker._delete(collection_of(worker), ["~nothing"])
-    hits = worker._search(collection_of(worker), VECTOR, 50, condition)
+    collection = Collection(worker.client, collection_of(worker))
+    collection.delete(["~nothing"])
+    hits = collection.search(VECTOR, 50, condition)
     return worker._in_circle(hits, circle)
 
 
@@ -305,11 +307,12 @@ def test_expression_selects_the_photos_that_match_the_filter(
 ) -> None:
     """As the mask of the scan and SQL do, by the same reference."""
     if not collections(worker):
-        worker._create_collection("placewise_filters_FLAT", 4, 1)
+        Collection(worker.client, "placewise_filters_FLAT").create(4, 1)
     photos = [data.draw(photo_facts(photo_id)) for photo_id in IDS[:count]]
     photo_filter = data.draw(photo_filters(photos))
     excluded = set(data.draw(some.lists(some.sampled_from(IDS), max_size=2)))
-    worker._delete("placewise_filters_FLAT", [photo_id.hex for photo_id in IDS])
+    filters = Collection(worker.client, "placewise_filters_FLAT")
+    filters.delete([photo_id.hex for photo_id in IDS])
     write(worker, photos, VECTOR)
     tags = sorted({tag for photo in photos for tag in photo.tags})
     condition = filter_expression(
@@ -325,7 +328,7 @@ def test_expression_selects_the_photos_that_match_the_filter(
 
 @whatever_the_catalog
 def test_levels_of_place_labels_have_no_wildcards(worker: MilvusWorker) -> None:
-    worker._create_collection("placewise_levels_FLAT", 4, 1)
+    Collection(worker.client, "placewise_levels_FLAT").create(4, 1)
     for level in ("a", "a%", 'a"b', "a_", "ä/b\\", "a/b"):
         labels = [level, f"{level}/x", f"{level}x", f"{level}0", "aXb/x", "", level.upper(), "ä"]
         write(worker, [facts_of(IDS[n], place=label) for n, label in enumerate(labels)], VECTOR)

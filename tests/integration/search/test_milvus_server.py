@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from services.search.milvus import MilvusWorker
+from services.search.milvus.worker import MilvusWorker
 from tests.contract.search import test_milvus
 from tests.contract.search.test_milvus import collections, on_milvus, port, worker
 from tests.support.servers.milvus import MilvusServer

@@ -1,10 +1,9 @@
-"""Search on Milvus, for maps larger than one machine.
+"""The search worker whose rows are in Milvus.
 
 `MilvusWorker` holds no rows: one worker at a time writes them to a collection of the generation,
 and all ask Milvus for candidates. The chunks in the object store stay the truth: cosines are
 computed from their rows, and what a collection lacks is written in steps of a few seconds and named
-in `missing` until then. A row of the collection that is no photo, its *mark*, has the version of
-the map up to which changes of photos are in it.
+in `missing` until then.
 """
 
 from __future__ import annotations
@@ -15,22 +14,30 @@ import math
 import random
 import time
 from collections import defaultdict, deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection as Values
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any, TypeVar
+from typing import Any
 from uuid import UUID
 
-import grpc
 import numpy as np
 import sqlalchemy as sa
 from numpy.typing import NDArray
-from pymilvus import DataType, MilvusClient, MilvusException
+from pymilvus import MilvusClient, MilvusException
 
 from services.search.dense_scan import ROUNDING, float32_error
 from services.search.executor import SCORE_DECIMALS, round_scores
-from services.search.milvus_filters import FINDABLE, filter_columns, filter_expression
+from services.search.milvus.collection import (
+    MAX_LIMIT,
+    MILVUS_ERRORS,
+    PHOTOS,
+    READ_SECONDS,
+    Collection,
+    engine_errors,
+)
+from services.search.milvus.filters import FINDABLE, filter_expression
 from services.search.snapshot import Snapshot
 from services.search.worker import SearchWorker
 from shared.catalog.chunks import (
@@ -64,41 +71,18 @@ from shared.storage import ObjectStore
 from shared.storage.chunks import Row, read_chunk, read_rows, rows_are_valid
 
 log = logging.getLogger(__name__)
-T = TypeVar("T")
 
-MILVUS_ERRORS = (MilvusException, grpc.RpcError, grpc.FutureTimeoutError)
 UNREADABLE = (Unavailable, NotFound, IndexError, ValueError, OSError)
 NO_COLLECTION = 100  # code of an error
-READ_SECONDS = 4.0  # less than the time that the gateway gives a search
-WRITE_SECONDS = 60.0
 STEP_SECONDS = 3.0  # of writing, between two snapshots
 UNKNOWN_SECONDS = 30.0  # a server that was just started may not know its collections yet
 CHECK_SECONDS = 60.0  # interval of the counts of what a collection holds, and of its recall
 BATCH_BYTES = 16_000_000  # of rows in one call; a message may have 64 MB
-IDS_PER_CALL = 1000
 FEW_ROWS = 32  # are read one by one, not with their whole chunk
 READ_THREADS = 16
-MAX_LIMIT = 16_384  # results of one search
-MAX_TEXT_BYTES = 65_535
 MARGIN = 16  # candidates beyond k, as products of float32 may rank the last ones otherwise
 GROWTH = 4  # of the number of candidates, where too few pass the filter or decide the answer
 RECALL_ANSWERS = 32
-MARK = "~version"  # keys of photos are hexadecimal digits
-PHOTOS = 'photo < "~"'
-
-INDEXES = {"FLAT": {}, "HNSW": {"M": 32, "efConstruction": 200}}  # FLAT compares all rows
-
-
-@contextlib.contextmanager
-def engine_errors() -> Iterator[None]:
-    """Raise Unavailable (`engine_unavailable`) for errors of Milvus and its connection."""
-    try:
-        yield
-    except MILVUS_ERRORS as error:
-        reason = getattr(error, "message", "") or type(error).__name__
-        raise Unavailable(
-            "engine_unavailable", f"Milvus does not answer: {reason}. Retry in a moment."
-        ) from error
 
 
 @contextlib.contextmanager
@@ -187,14 +171,14 @@ class MilvusWorker(SearchWorker):
         return sorted(name for name in names if name.startswith(self._prefix))
 
     @engine_errors()
-    def _remove_stored(self, stored: list[str], known: Collection[UUID]) -> None:
+    def _remove_stored(self, stored: list[str], known: Values[UUID]) -> None:
         for ended in self._watches.keys() - known:
             del self._watches[ended]
         newest = {UUID(name.split("_")[2]): name for name in stored}
         for name in stored:
             if name not in [newest.get(one) for one in known]:
                 log.info("dropping the collection %s, which is no longer used", name)
-                self.client.drop_collection(name, timeout=WRITE_SECONDS)
+                Collection(self.client, name).drop()
 
     def _needs_reload(self, snapshot: Snapshot) -> bool:
         assert isinstance(snapshot, MilvusSnapshot)
@@ -204,7 +188,8 @@ class MilvusWorker(SearchWorker):
         if snapshot.unwritten or self._unreadable.any_due(snapshot.missing) or watch.wrong:
             return True
         with contextlib.suppress(*MILVUS_ERRORS):  # perhaps it was dropped
-            is_current = self._read_mark(snapshot.collection) == snapshot.version
+            mark = Collection(self.client, snapshot.collection).read_mark()
+            is_current = mark == snapshot.version
             return not is_current or time.monotonic() >= watch.check_at
         return True
 
@@ -224,7 +209,8 @@ class MilvusWorker(SearchWorker):
         # never reads another one than it was made of.
         prefix, watch = f"{self._prefix}{generation_id.hex}_", self._watches[generation_id]
         name = max((name for name in self._list_stored() if name.startswith(prefix)), default="")
-        marked = self._open_collection(watch, name) if name else None
+        collection = Collection(self.client, name)
+        marked = self._load_collection(watch, collection) if name else None
         with self._catalog.read() as session:
             generation = session.get(Generation, generation_id)
             if generation is None:
@@ -244,26 +230,27 @@ class MilvusWorker(SearchWorker):
             number = max(time.time_ns(), last + 1)
             name, marked = f"{prefix}{number:x}_{self._index}", version
             log.info("creating the collection %s", name)
-            self._create_collection(name, generation.dimension, version)
+            collection = Collection(self.client, name)
+            collection.create(generation.dimension, version)
         written: frozenset[str] = frozenset()
         if marked is not None:
             if isinstance(old, MilvusSnapshot) and old.collection == name:
                 written = old.written & chunks.keys()
             if is_writer:
-                written -= self._apply_changes(generation_id, name, chunks, changes)
+                written -= self._apply_changes(generation_id, collection, chunks, changes)
                 marked = version
                 if since < version:
-                    self._write_mark(name, generation.dimension, version)
-            written |= self._write_chunks(name, chunks, written, is_writer)
+                    collection.write_mark(generation.dimension, version)
+            written |= self._write_chunks(collection, chunks, written, is_writer)
             if is_writer and written == chunks.keys():
-                written = self._find_losses(generation_id, name, described, written)
+                written = self._find_losses(generation_id, collection, described, written)
             if described is not None:
                 watch.check_at = time.monotonic() + CHECK_SECONDS
                 self._measure_recall(watch, list(chunks.values()))
             # Searches wait for the time of this process's last write ("Session"), and so see what
             # any process wrote before. With "Strong" each would wait for the present time, which
             # Milvus announces five times a second.
-            self._delete(name, ["~nothing"])
+            collection.delete(["~nothing"])
         others = chunks.keys() - written
         unwritten = frozenset(key for key in others if self._unreadable.is_due(key))
         return MilvusSnapshot(
@@ -275,19 +262,18 @@ class MilvusWorker(SearchWorker):
             collection="" if marked is None else name,
             written=written,
             unwritten=unwritten,
-            live_rows=self._count(name, FINDABLE) if marked is not None else 0,
+            live_rows=collection.count(FINDABLE) if marked is not None else 0,
             row_length=generation.dimension if chunks else 0,
         )
 
-    def _open_collection(self, watch: _Watch, name: str) -> int | None:
+    def _load_collection(self, watch: _Watch, collection: Collection) -> int | None:
         """Return the version of the mark; None if the collection has none.
 
         Milvus may list a collection that it no longer has, for example one that was being dropped
         when it was killed: that is given up after a while.
         """
         try:
-            self.client.load_collection(name, timeout=WRITE_SECONDS)
-            marked = self._read_mark(name)
+            marked = collection.load()
         except MilvusException as error:
             watch.unknown_since = min(watch.unknown_since, time.monotonic())
             waited = time.monotonic() - watch.unknown_since
@@ -297,72 +283,32 @@ class MilvusWorker(SearchWorker):
         watch.unknown_since = math.inf
         return marked
 
-    def _create_collection(self, name: str, dimension: int, version: int) -> None:
-        """Create a collection whose photos are to be written as of `version`."""
-        text = {"max_length": MAX_TEXT_BYTES}
-        schema = MilvusClient.create_schema(auto_id=False, enable_dynamic_field=False)
-        schema.add_field("photo", DataType.VARCHAR, is_primary=True, max_length=40)
-        schema.add_field("vector", DataType.FLOAT_VECTOR, dim=dimension)
-        schema.add_field("findable", DataType.BOOL)
-        schema.add_field("captured_at", DataType.INT64)
-        schema.add_field("latitude", DataType.DOUBLE)
-        schema.add_field("longitude", DataType.DOUBLE)
-        schema.add_field("place", DataType.VARCHAR, **text)
-        tags = {"element_type": DataType.VARCHAR, "max_capacity": 4096, **text}
-        schema.add_field("tags", DataType.ARRAY, **tags)
-        index = MilvusClient.prepare_index_params()
-        index.add_index("vector", self._index, metric_type="IP", params=INDEXES[self._index])
-        options = {"consistency_level": "Strong", "timeout": WRITE_SECONDS}
-        self.client.create_collection(name, schema=schema, index_params=index, **options)
-        self._write_mark(name, dimension, version)
-
-    def _read_mark(self, name: str) -> int | None:
-        found = self._get(name, [MARK], "captured_at")
-        return found[0] if found else None
-
-    def _write_mark(self, name: str, dimension: int, version: int) -> None:
-        """Say that all changes up to this version are written."""
-        mark = {"photo": MARK, "captured_at": version, "findable": False, "place": "", "tags": []}
-        where = {"latitude": 0.0, "longitude": 0.0, "vector": [1.0] + [0.0] * (dimension - 1)}
-        self.client.upsert(name, [mark | where], timeout=WRITE_SECONDS)
-
-    def _get(self, name: str, keys: Sequence[str], column: str) -> list[Any]:
-        """Return the column of those of these rows that are there."""
-        options = {"output_fields": [column], "consistency_level": "Strong"}
-        get = partial(self.client.get, name, timeout=READ_SECONDS, **options)
-        return [row[column] for some in _batches(keys, IDS_PER_CALL) for row in get(some)]
-
-    def _count(self, name: str, condition: str) -> int:
-        options = {"output_fields": ["count(*)"], "consistency_level": "Strong"}
-        found = self.client.query(name, filter=condition, timeout=READ_SECONDS, **options)
-        return int(found[0]["count(*)"])
-
-    def _delete(self, name: str, keys: Sequence[str]) -> None:
-        for some in _batches(keys, IDS_PER_CALL):
-            self.client.delete(name, ids=some, timeout=WRITE_SECONDS)
-
     def _apply_changes(
         self,
         generation_id: UUID,
-        name: str,
+        collection: Collection,
         chunks: dict[str, Chunk],
         changes: Sequence[PhotoFilterValues],
     ) -> set[str]:
         """Write the changed photos anew; returns the chunks that can't be read for that."""
         kept = {photo.photo_id: photo for photo in changes if photo.deleted_at is None}
-        self._delete(name, [photo.photo_id.hex for photo in changes if photo.deleted_at])
+        collection.delete([photo.photo_id.hex for photo in changes if photo.deleted_at])
         with self._catalog.read() as session:
             located = find_descriptor_rows(session, generation_id, list(kept))
         lost = set()
         for key, found in located.items():
             photos = [(row, kept[photo_id]) for row, photo_id in found]
-            if key not in chunks or not self._write_photos(name, chunks[key], photos):
-                self._delete(name, [photo.photo_id.hex for _, photo in photos])
+            if key not in chunks or not self._write_photos(collection, chunks[key], photos):
+                collection.delete([photo.photo_id.hex for _, photo in photos])
                 lost.add(key)
         return lost
 
     def _write_chunks(
-        self, name: str, chunks: dict[str, Chunk], written: Collection[str], is_writer: bool
+        self,
+        collection: Collection,
+        chunks: dict[str, Chunk],
+        written: Values[str],
+        is_writer: bool,
     ) -> set[str]:
         """Return which of the other chunks are there, after writing some if this is the writer."""
         ends_at = time.monotonic() + STEP_SECONDS
@@ -370,19 +316,22 @@ class MilvusWorker(SearchWorker):
         # The newest first: a query may wait for a photo that was just published.
         waiting = sorted(chunks.keys() - written, key=lambda key: chunks[key].id, reverse=True)
         for key in waiting:
-            lacking = self._find_lacking(name, chunks[key])
+            lacking = self._find_lacking(collection, chunks[key])
             may_write = is_writer and self._unreadable.is_due(key)
-            if lacking and may_write and self._write_photos(name, chunks[key], lacking):
+            if lacking and may_write and self._write_photos(collection, chunks[key], lacking):
                 lacking = []
             if lacking == []:
                 new.add(key)
             if time.monotonic() >= ends_at:
                 break
         if len(new) < len(waiting):
-            log.info("%s: %d of %d chunks are written", name, len(written) + len(new), len(chunks))
+            count = len(written) + len(new)
+            log.info("%s: %d of %d chunks are written", collection.name, count, len(chunks))
         return new
 
-    def _find_lacking(self, name: str, chunk: Chunk) -> list[tuple[int, PhotoFilterValues]] | None:
+    def _find_lacking(
+        self, collection: Collection, chunk: Chunk
+    ) -> list[tuple[int, PhotoFilterValues]] | None:
         """Return the rows of a chunk, with their live photos, that are not in the collection.
 
         None if it was merged since the chunks were listed: its photos are in another one then.
@@ -393,11 +342,11 @@ class MilvusWorker(SearchWorker):
                 return None
             values = list_live_filter_values(session, chunk.id)
         photos = [(row, photo) for row, photo in values if photo.deleted_at is None]
-        there = set(self._get(name, [photo.photo_id.hex for _, photo in photos], "photo"))
+        there = set(collection.get([photo.photo_id.hex for _, photo in photos], "photo"))
         return [(row, photo) for row, photo in photos if photo.photo_id.hex not in there]
 
     def _write_photos(
-        self, name: str, chunk: Chunk, photos: Sequence[tuple[int, PhotoFilterValues]]
+        self, collection: Collection, chunk: Chunk, photos: Sequence[tuple[int, PhotoFilterValues]]
     ) -> bool:
         """Write rows of a chunk with the values of their photos; False if it can't be read."""
         numbers = [row for row, _ in photos]
@@ -408,10 +357,7 @@ class MilvusWorker(SearchWorker):
             else:
                 stored = read_chunk(self._store, chunk.object_key, chunk.sha256)
                 rows = stored[numbers].astype(np.float32)
-            pairs = list(zip(photos, rows, strict=True))
-            for some in _batches(pairs, min(size, IDS_PER_CALL)):
-                data = [{**filter_columns(photo), "vector": row} for (_, photo), row in some]
-                self.client.upsert(name, data, timeout=WRITE_SECONDS)
+            collection.write([(p, row) for (_, p), row in zip(photos, rows, strict=True)], size)
         except UNREADABLE as error:
             self._unreadable.failed(chunk.object_key, error)
             return False
@@ -419,21 +365,21 @@ class MilvusWorker(SearchWorker):
         return True
 
     def _find_losses(
-        self, generation_id: UUID, name: str, described: int | None, written: frozenset[str]
+        self,
+        generation_id: UUID,
+        collection: Collection,
+        described: int | None,
+        written: frozenset[str],
     ) -> frozenset[str]:
         """Delete rows that no chunk has; returns `written`, or none if rows may have been lost."""
         watch = self._watches[generation_id]
         others, watch.wrong = watch.wrong, set()
-        if not others and (described is None or self._count(name, PHOTOS) == described):
+        if not others and (described is None or collection.count(PHOTOS) == described):
             return written
-        log.warning("%s does not hold what the chunks do: its photos are compared", name)
+        log.warning("%s does not hold what the chunks do: its photos are compared", collection.name)
         with self._catalog.read() as session:
             photos = {photo_id.hex for photo_id in list_described(session, generation_id)}
-        options = {"output_fields": ["photo"], "consistency_level": "Strong", "filter": PHOTOS}
-        rows = self.client.query_iterator(name, MAX_LIMIT, timeout=WRITE_SECONDS, **options)
-        while batch := rows.next():
-            others |= {row["photo"] for row in batch} - photos
-        self._delete(name, sorted(others))
+        collection.delete(sorted(others | collection.find_others(photos)))
         return frozenset()
 
     def _measure_recall(self, watch: _Watch, chunks: Sequence[Chunk]) -> None:
@@ -478,7 +424,8 @@ class MilvusWorker(SearchWorker):
         length = float(np.linalg.norm(query.astype(np.float64)))
         unit = (query / (length or 1.0)).astype(np.float32)
         error = float32_error(len(query)) + 2 * ROUNDING + 10.0**-SCORE_DECIMALS
-        is_exact = not snapshot.collection or snapshot.collection.endswith("FLAT")
+        collection = Collection(self.client, snapshot.collection)
+        is_exact = not snapshot.collection or collection.is_exact
         limit = min(request.k + MARGIN, MAX_LIMIT)
         products: dict[UUID, float] = {}
         scores: dict[UUID, float] = {}
@@ -486,7 +433,7 @@ class MilvusWorker(SearchWorker):
         hits: tuple[SearchHit, ...] = ()
         complete = not snapshot.collection or not length
         while not complete:
-            found = self._search(snapshot.collection, unit, limit, condition)
+            found = collection.search(unit, limit, condition)
             near = self._in_circle(found, request.photos.near) - products.keys()
             products |= {UUID(hit["entity"]["photo"]): hit["distance"] for hit in found}
             exact, unreadable = self._score(snapshot.generation_id, list(near), query)
@@ -517,22 +464,6 @@ class MilvusWorker(SearchWorker):
             missing=tuple(sorted(missing)),
             filling=bool(snapshot.unwritten),
         )
-
-    def _search(self, name: str, query: Row, limit: int, condition: str) -> Sequence[Any]:
-        """Return the rows with the largest products with the query, largest first."""
-        # An index that looks at no more candidates than it returns misses some.
-        effort = {} if name.endswith("FLAT") else {"ef": max(256, 2 * limit)}
-        (found,) = self.client.search(
-            name,
-            data=[query],
-            limit=limit,
-            filter=condition,
-            output_fields=["photo", "latitude", "longitude"],
-            search_params={"metric_type": "IP", "params": effort},
-            consistency_level="Session",
-            timeout=READ_SECONDS,
-        )
-        return list(found)
 
     @staticmethod
     def _in_circle(hits: Sequence[Any], circle: Circle | None) -> set[UUID]:
@@ -574,7 +505,3 @@ class MilvusWorker(SearchWorker):
         if not rows_are_valid(rows).all():
             raise ValueError(f"rows of {key} are no unit vectors")
         return rows
-
-
-def _batches(items: Sequence[T], size: int) -> Iterator[Sequence[T]]:
-    return (items[begin : begin + size] for begin in range(0, len(items), size))

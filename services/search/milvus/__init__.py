@@ -1,0 +1,1 @@
+"""Search on Milvus, for maps larger than one machine."""
