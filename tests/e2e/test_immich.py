@@ -18,6 +18,7 @@ from tests.support.server import ServerProcess, environment, run_command
 
 DEGREES_APART = 0.0005
 LONGITUDE = 7.0
+LOCATED = 16
 UNLOCATED = (3, 9, 15)
 
 
@@ -26,7 +27,7 @@ def position(number: int) -> tuple[float, float]:
 
 
 class Walk:
-    """Twenty photos of a camera in Immich with coordinates, and three between them without."""
+    """Photos of a camera in Immich with coordinates, and three between them without."""
 
     def __init__(self, immich: ImmichServer, server: ServerProcess, folder: Path) -> None:
         self.immich, self.home, self.folder = immich, server.home, folder
@@ -37,7 +38,7 @@ class Walk:
             number: immich.add(
                 f"IMG_{2 * number}.jpg", photo_bytes(number), position(number), 60 * number, "Trip"
             )
-            for number in range(1, 21)
+            for number in range(1, LOCATED + 1)
         }
         self.unlocated = {
             number: immich.add(
@@ -85,8 +86,8 @@ def walk(server: ServerProcess, tmp_path: Path) -> Iterator[Walk]:
 def test_photos_are_indexed_and_proposed_and_immich_is_changed_only_with_write(walk: Walk) -> None:
     report = json.loads(walk.run("--json"))
     assert report["indexed"] == {
-        "with_coordinates": 20, "indexed": 20, "changed": 0, "removed": 0, "searchable": 20,
-        "failed": [],
+        "with_coordinates": LOCATED, "indexed": LOCATED, "changed": 0, "removed": 0,
+        "searchable": LOCATED, "failed": [],
     }  # fmt: skip
     assert walk.immich.updates == []
     proposals = {each["filename"]: each for each in report["proposals"]}
@@ -121,7 +122,7 @@ def test_the_map_follows_what_was_changed_moved_or_deleted(walk: Walk) -> None:
     counts = walk.indexed()
     assert (counts["indexed"], counts["changed"], counts["removed"]) == (2, 1, 2)
     photos = {photo.relative_path: photo for photo in walk.client.photos()}
-    assert len(photos) == counts["searchable"] == 19
+    assert len(photos) == counts["searchable"] == LOCATED - 1
     assert "Trip/IMG_8.jpg" not in photos
     assert "Trip/IMG_10.jpg" not in photos
     assert (photos["Trip/IMG_2.jpg"].latitude, photos["Trip/IMG_2.jpg"].longitude) == (1.5, 8.0)
@@ -129,7 +130,7 @@ def test_the_map_follows_what_was_changed_moved_or_deleted(walk: Walk) -> None:
     walk.immich.assets[moved]["originalFileName"] = "renamed.jpg"
     walk.immich.assets[replaced]["fileModifiedAt"] = time_text(NOON + timedelta(days=1))
     counts = walk.indexed()
-    assert (counts["changed"], counts["indexed"], counts["searchable"]) == (1, 1, 19)
+    assert (counts["changed"], counts["indexed"], counts["searchable"]) == (1, 1, LOCATED - 1)
     assert "Trip/renamed.jpg" in {photo.relative_path for photo in walk.client.photos()}
 
 
@@ -196,7 +197,7 @@ def test_a_missing_key_or_permission_is_named_and_nothing_is_changed(walk: Walk)
     walk.immich.permissions.remove("asset.read")
     assert "Missing required permission: asset.read" in walk.run(code=1)
     assert walk.immich.updates == []
-    assert len(list(walk.client.photos())) == 20
+    assert len(list(walk.client.photos())) == LOCATED
 
 
 def test_the_job_of_a_server_follows_immich_and_names_its_error(tmp_path: Path) -> None:
@@ -208,8 +209,8 @@ def test_the_job_of_a_server_follows_immich_and_names_its_error(tmp_path: Path) 
                 job = client.wait(client.sync_library(every_hours=24))
                 assert job.kind == "sync_library"
                 assert job.result == {
-                    "with_coordinates": 20, "indexed": 20, "changed": 0, "removed": 0,
-                    "searchable": 20, "failed": [], "without_coordinates": 3, "located": 3,
+                    "with_coordinates": LOCATED, "indexed": LOCATED, "changed": 0, "removed": 0,
+                    "searchable": LOCATED, "failed": [], "without_coordinates": 3, "located": 3,
                     "every_hours": 24,
                 }  # fmt: skip
                 assert immich.updates == []

@@ -16,7 +16,7 @@ from tests.integration.evaluated_map import EvaluatedMap
 from tests.integration.steward.streets import at
 from tests.support.local_features import add_features, scene_features
 
-PLACES = 30
+PLACES, FEW_PLACES = 30, 15
 PER_PLACE = 4
 NOISE_DEGREES = 8.0
 
@@ -64,7 +64,8 @@ def test_matches_with_which_fewer_are_answered_are_used_only_if_the_map_says_so(
     city: EvaluatedMap, monkeypatch: pytest.MonkeyPatch, matching: Matching, used: bool | None
 ) -> None:
     monkeypatch.setattr(map_evaluation, "answers_less", lambda without, with_matches: True)
-    publish_clustered(city)
+    monkeypatch.setattr(map_evaluation, "MIN_PHOTOS_TO_DECIDE", FEW_PLACES * PER_PLACE)
+    publish_clustered(city, FEW_PLACES)
     set_matching(city, matching)
     city.figures()
     assert generation(city).uses_matches is used
@@ -78,14 +79,16 @@ def test_photos_without_features_leave_it_open(city: EvaluatedMap) -> None:
     assert generation(city).uses_matches is None
 
 
-def publish_clustered(city: EvaluatedMap, *, with_features: bool = True) -> None:
+def publish_clustered(
+    city: EvaluatedMap, places: int = PLACES, *, with_features: bool = True
+) -> None:
     """Photos of places at angles that overlap, with the points of their places."""
     rng = np.random.default_rng(0)
-    numbers = range(PLACES * PER_PLACE)
+    numbers = range(places * PER_PLACE)
     seen: list[tuple[float, dict[str, Any]]] = []
     for number in numbers:
         place, walk = number // PER_PLACE, "abcd"[number % PER_PLACE]
-        angle = 360 / PLACES * place + NOISE_DEGREES * rng.normal()
+        angle = 360 / places * place + NOISE_DEGREES * rng.normal()
         seen.append((angle, at(place, filename=f"{walk}{place}.jpg")))
     ids = city.publish(seen)
     if with_features:
