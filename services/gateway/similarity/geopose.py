@@ -10,7 +10,6 @@ readings of all sensors, whose cameras have parameters; version 2 lists each kin
 from __future__ import annotations
 
 import base64
-import binascii
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -126,7 +125,7 @@ class GeoPoseRequest(_Sent):
             raise invalid_field_error("imageOrientation", "is not upright; turn the photo")
         try:
             return base64.b64decode(reading.image_bytes.rpartition(",")[2], validate=True)
-        except binascii.Error as error:
+        except ValueError as error:
             raise invalid_field_error("imageBytes", f"is not base64: {error}") from error
 
     def search_params(self, header: PhotoHeader) -> SearchParams:

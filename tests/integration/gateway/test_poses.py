@@ -388,6 +388,7 @@ def test_request_of_the_geopose_protocol_is_answered_with_the_pose_of_its_camera
         ({"imageOrientation": {"mirrored": True}}, 422, "invalid_field", "not upright"),
         ({"imageOrientation": {"rotation": 90}}, 422, "invalid_field", "not upright"),
         ({"imageBytes": "data:image/jpeg;base64,%"}, 422, "invalid_field", "not base64"),
+        ({"imageBytes": "ä"}, 422, "invalid_field", "not base64"),
         ({"imageBytes": "AAAA"}, 415, "unsupported_photo", "not a photo"),
     ],
 )
