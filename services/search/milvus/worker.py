@@ -434,6 +434,12 @@ class MilvusWorker(SearchWorker):
         complete = not snapshot.collection or not length
         while not complete:
             found = collection.search(unit, limit, condition)
+            if len(found) < min(limit, snapshot.live_rows) and not collection.has_mark():
+                # While it is dropped, a collection answers with fewer rows, or none.
+                raise Unavailable(
+                    "engine_unavailable",
+                    f"The collection {collection.name} has lost its rows. Retry in a moment.",
+                )
             near = self._in_circle(found, request.photos.near) - products.keys()
             products |= {UUID(hit["entity"]["photo"]): hit["distance"] for hit in found}
             exact, unreadable = self._score(snapshot.generation_id, list(near), query)

@@ -16,7 +16,7 @@ from hypothesis import strategies as some
 from pydantic import SecretStr
 
 from services.search.milvus import worker as milvus_module
-from services.search.milvus.collection import Collection
+from services.search.milvus.collection import MARK, Collection
 from services.search.milvus.filters import filter_columns, filter_expression
 from services.search.milvus.worker import MilvusWorker
 from services.search.worker import SearchWorker
@@ -96,6 +96,18 @@ class MilvusContract(AnswersContract):
     """The promises that depend on Milvus."""
 
     holds_rows = False
+
+    def test_search_of_a_collection_that_has_lost_its_rows_is_refused(
+        self, places: SmallMap, worker: MilvusWorker
+    ) -> None:
+        photo_ids = places.add(unit_rows(1, 5))
+        complete(worker)
+        request = places.request(places.query(unit_rows(9, 1)[0]), k=20)
+        assert len(worker.search(request).hits) == 5
+        lost = [MARK, *(photo_id.hex for photo_id in photo_ids)]
+        Collection(worker.client, collection_of(worker)).delete(lost)
+        with pytest.raises(Unavailable, match="has lost its rows"):
+            worker.search(request)
 
     def test_collection_that_was_dropped_is_filled_again_and_answers_say_what_is_missing(
         self,
