@@ -167,6 +167,7 @@ class ExtractorWorker:
     def drain(self, stop: threading.Event) -> bool:
         """Process jobs until none is claimable, or `stop` is set; return whether there was one."""
         self._stop = stop
+        self._heartbeat.beat()
         batch = self._claim() if self._runner.has_jobs() else None  # most looks find none
         if batch is None:
             return False

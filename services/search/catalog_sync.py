@@ -22,12 +22,12 @@ from sqlalchemy import select
 from services.search.chunk_loader import (
     ChunkLoader,
     LoadedChunk,
+    MemoryBudget,
     hold_in_memory,
     memory_parts,
 )
 from services.search.dense_scan import compile_kernel
 from services.search.photo_columns import PhotoColumns
-from services.search.residency import MemoryBudget
 from services.search.snapshot import Snapshot
 from shared.catalog.chunks import list_live_chunks, list_live_filter_values
 from shared.catalog.database.session import Catalog

@@ -3,7 +3,7 @@
 `MappedFileCache` maps objects with verified hashes: a file-based object store is mapped in place;
 from other stores, objects are downloaded into a cache folder, which any number of search workers of
 this machine may share. `ChunkLoader` opens the chunks of a generation, with codes that are missing
-computed from the rows. `LoadedChunk` is what a snapshot holds of a chunk.
+computed from the rows. `MemoryBudget` decides which parts of a `LoadedChunk` are in memory.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ import mmap
 import os
 import shutil
 import sys
-from collections.abc import Callable, Collection, Iterable, Sequence
+import threading
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -293,6 +294,38 @@ def hold_in_memory(chunk: LoadedChunk, parts: int) -> LoadedChunk:
         )
     rows: StoredRows = _in_memory(stored.rows, chunk.rows, parts > part)
     return replace(chunk, rows=rows, codes=codes)
+
+
+class MemoryBudget:
+    """Memory budget shared by the generations of a worker; thread-safe."""
+
+    def __init__(self, budget_bytes: int) -> None:
+        self._budget_bytes = budget_bytes
+        self._lock = threading.Lock()
+        self._requests: dict[UUID, Sequence[int]] = {}
+
+    def allocate(self, generation_id: UUID, part_bytes: Sequence[int]) -> int:
+        """Return how many of the generation's first parts, of these sizes, are to be resident."""
+        with self._lock:
+            self._requests[generation_id] = part_bytes
+            return allocate_parts(self._requests, self._budget_bytes)[generation_id]
+
+    def release_generation(self, generation_id: UUID) -> None:
+        """Release the memory of a generation."""
+        with self._lock:
+            self._requests.pop(generation_id, None)
+
+
+def allocate_parts(requests: Mapping[UUID, Sequence[int]], budget_bytes: int) -> dict[UUID, int]:
+    """Return how many parts of each generation fit: all first parts before any second part."""
+    counts = dict.fromkeys(requests, 0)
+    remaining = budget_bytes
+    for part in range(max(map(len, requests.values()), default=0)):
+        for generation_id, sizes in requests.items():
+            if counts[generation_id] == part < len(sizes) and sizes[part] <= remaining:
+                remaining -= sizes[part]
+                counts[generation_id] += 1
+    return counts
 
 
 def memory_parts(chunks: Sequence[LoadedChunk]) -> list[int]:

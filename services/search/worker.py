@@ -26,13 +26,16 @@ from services.search.catalog_sync import (
     read_generation_versions,
     sync_snapshot,
 )
-from services.search.chunk_loader import list_generation_folders, remove_stale_folders
+from services.search.chunk_loader import (
+    MemoryBudget,
+    list_generation_folders,
+    remove_stale_folders,
+)
 from services.search.executor import execute_query
 from services.search.photo_columns import build_row_mask
 from services.search.photo_matcher import PhotoMatcher
 from services.search.pose_estimator import PoseEstimator
 from services.search.query_batcher import QueryBatcher
-from services.search.residency import MemoryBudget
 from services.search.snapshot import Snapshot
 from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.session import Catalog, ChangePoll

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import itertools
 import re
 from pathlib import Path
@@ -17,7 +18,10 @@ from tests.support.server import CommandLine, ServerProcess
 SETTINGS = {"auto_evaluate_photos": 0}
 MAPS = "/api/v1/maps"
 POSE = {"camera": 0, "rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}
+PHOTO = base64.b64encode(photo_bytes(1)).decode()
 BODIES: dict[str, Any] = {
+    "geopose": {"sensorReadings": {"cameraReadings": [{"imageBytes": PHOTO}]}},
+    "places": {"photos": [{"file_id": str(uuid4()), "latitude": 45.0, "longitude": 7.0}]},
     "positions": {"photos": []},
     "import": {
         "cameras": [{"model": "SIMPLE_PINHOLE", "width": 4, "height": 3, "params": [4, 2, 1.5]}],

@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
+from typing import BinaryIO
 
 from services.cli.ingest.local_headers import (
     dated_photo,
@@ -55,6 +56,10 @@ class LocalPhoto:
     """Path in the folder that is indexed."""
     sidecars: Mapping[str, bytes] = field(default_factory=dict)
     """XMP by path"""
+
+    def content(self) -> Path | BinaryIO:
+        """Return the file, or what was fetched of a photo that is none. Raises PlacewiseError."""
+        return self.path
 
 
 def find_local_sources(sources: Sequence[str]) -> list[Path] | None:

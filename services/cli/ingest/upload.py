@@ -162,8 +162,8 @@ def _upload_concurrently(
     def upload(photo: LocalPhoto) -> Uploaded | PlacewiseError:
         fields: dict[str, Any] = {"relative_path": photo.relative_path, **photo.fields}
         name = photo.name or printable_name(photo.path)
-        send = partial(client.upload, photo.path, filename=name, **fields)
         try:
+            send = partial(client.upload, photo.content(), filename=name, **fields)
             try:
                 return send()
             except Conflict as error:

@@ -44,7 +44,6 @@ POOR_SHARE = 0.5
 ENOUGH_SHARE = 0.9
 """of the photos in the largest component: a second run would add little"""
 
-
 Judged = tuple[Any, set[str], NDArray[np.bool_]]
 """A model of pycolmap with its misplaced photos and the matches that led there"""
 

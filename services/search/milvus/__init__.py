@@ -1,1 +1,0 @@
-"""Search on Milvus, for maps larger than one machine."""

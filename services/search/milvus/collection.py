@@ -92,20 +92,15 @@ class Collection:
         found = self.get([MARK], "captured_at")
         return found[0] if found else None
 
-    def has_mark(self) -> bool:
-        """Return whether the mark is there; faster than `read_mark`, which waits for all writes."""
-        options = {"output_fields": ["photo"], "consistency_level": "Session"}
-        return bool(self.client.get(self.name, [MARK], timeout=READ_SECONDS, **options))
-
     def write_mark(self, dimension: int, version: int) -> None:
         """Say that all changes up to this version are written."""
         mark = {"photo": MARK, "captured_at": version, "findable": False, "place": "", "tags": []}
         where = {"latitude": 0.0, "longitude": 0.0, "vector": [1.0] + [0.0] * (dimension - 1)}
         self.client.upsert(self.name, [mark | where], timeout=WRITE_SECONDS)
 
-    def get(self, keys: Sequence[str], column: str) -> list[Any]:
+    def get(self, keys: Sequence[str], column: str, consistency: str = "Strong") -> list[Any]:
         """Return the column of those of these rows that are there."""
-        options = {"output_fields": [column], "consistency_level": "Strong"}
+        options = {"output_fields": [column], "consistency_level": consistency}
         get = partial(self.client.get, self.name, timeout=READ_SECONDS, **options)
         return [row[column] for some in batches(keys, IDS_PER_CALL) for row in get(some)]
 

@@ -30,6 +30,7 @@ from pymilvus import MilvusClient, MilvusException
 from services.search.dense_scan import ROUNDING, float32_error
 from services.search.executor import SCORE_DECIMALS, round_scores
 from services.search.milvus.collection import (
+    MARK,
     MAX_LIMIT,
     MILVUS_ERRORS,
     PHOTOS,
@@ -434,12 +435,9 @@ class MilvusWorker(SearchWorker):
         complete = not snapshot.collection or not length
         while not complete:
             found = collection.search(unit, limit, condition)
-            if len(found) < min(limit, snapshot.live_rows) and not collection.has_mark():
-                # While it is dropped, a collection answers with fewer rows, or none.
-                raise Unavailable(
-                    "engine_unavailable",
-                    f"The collection {collection.name} has lost its rows. Retry in a moment.",
-                )
+            lacks_rows = len(found) < min(limit, snapshot.live_rows)  # or the filter left few
+            if lacks_rows and not collection.get([MARK], "photo", "Session"):  # being dropped
+                raise Unavailable("engine_unavailable", f"{collection.name} has lost its rows.")
             near = self._in_circle(found, request.photos.near) - products.keys()
             products |= {UUID(hit["entity"]["photo"]): hit["distance"] for hit in found}
             exact, unreadable = self._score(snapshot.generation_id, list(near), query)

@@ -19,14 +19,15 @@ import shared.codes.serialization
 from services.search.chunk_loader import (
     ChunkLoader,
     LoadedChunk,
+    MemoryBudget,
     StoredChunk,
+    allocate_parts,
     hold_in_memory,
     list_generation_folders,
     memory_parts,
     remove_stale_folders,
 )
 from services.search.photo_columns import PhotoColumns
-from services.search.residency import MemoryBudget, allocate_parts
 from shared.catalog.chunks import Chunk
 from shared.codes.sign_codes import encode_signs
 from shared.errors import Unavailable

@@ -10,12 +10,7 @@ import pycolmap
 import pytest
 
 from services.extractor.geometry.imported_models import import_model, turned_camera
-from services.extractor.geometry.mapping import (
-    Judged,
-    MappedComponent,
-    count_joined,
-    map_photos,
-)
+from services.extractor.geometry.mapping import Judged, MappedComponent, count_joined, map_photos
 from services.extractor.geometry.matching import VerifiedMatches, match_pairs
 from services.extractor.geometry.pycolmap_models import PhotoToMap
 from shared.errors import Unprocessable
