@@ -98,9 +98,9 @@ class Collection:
         where = {"latitude": 0.0, "longitude": 0.0, "vector": [1.0] + [0.0] * (dimension - 1)}
         self.client.upsert(self.name, [mark | where], timeout=WRITE_SECONDS)
 
-    def get(self, keys: Sequence[str], column: str, consistency: str = "Strong") -> list[Any]:
+    def get(self, keys: Sequence[str], column: str) -> list[Any]:
         """Return the column of those of these rows that are there."""
-        options = {"output_fields": [column], "consistency_level": consistency}
+        options = {"output_fields": [column], "consistency_level": "Strong"}
         get = partial(self.client.get, self.name, timeout=READ_SECONDS, **options)
         return [row[column] for some in batches(keys, IDS_PER_CALL) for row in get(some)]
 

@@ -30,7 +30,6 @@ from pymilvus import MilvusClient, MilvusException
 from services.search.dense_scan import ROUNDING, float32_error
 from services.search.executor import SCORE_DECIMALS, round_scores
 from services.search.milvus.collection import (
-    MARK,
     MAX_LIMIT,
     MILVUS_ERRORS,
     PHOTOS,
@@ -435,8 +434,8 @@ class MilvusWorker(SearchWorker):
         complete = not snapshot.collection or not length
         while not complete:
             found = collection.search(unit, limit, condition)
-            lacks_rows = len(found) < min(limit, snapshot.live_rows)  # or the filter left few
-            if lacks_rows and not collection.get([MARK], "photo", "Session"):  # being dropped
+            expected = snapshot.live_rows if condition == FINDABLE else 1
+            if len(found) < min(limit, expected) and collection.read_mark() is None:
                 raise Unavailable("engine_unavailable", f"{collection.name} has lost its rows.")
             near = self._in_circle(found, request.photos.near) - products.keys()
             products |= {UUID(hit["entity"]["photo"]): hit["distance"] for hit in found}
