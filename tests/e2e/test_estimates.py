@@ -35,7 +35,7 @@ def fill(server: ServerProcess, name: str, numbers: list[int], *about: dict[str,
 
 
 def put(server: ServerProcess, name: str, photos: list[tuple[bytes, dict[str, Any]]]) -> None:
-    """Upload photos with what is said of them, and wait until all can be found."""
+    """Upload photos with their metadata, and wait until all can be found."""
     uploads = [server.upload(data, map_name=name, **fields) for data, fields in photos]
     for upload in uploads:
         job = server.finished(got(upload, 202)["job_id"], map=name)

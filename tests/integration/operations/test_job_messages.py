@@ -249,12 +249,12 @@ def test_a_thread_that_redis_does_not_answer_is_stuck_unless_redis_answers_nobod
 def test_a_busy_extractor_takes_the_messages_of_queries_and_leaves_those_of_photos(
     wakeups: CeleryJobMessages, app: Celery, own_redis: RedisServer, client: Redis
 ) -> None:
-    stop, asked = threading.Event(), threading.Event()
+    stop, arrived = threading.Event(), threading.Event()
     settings = Settings(redis_url=own_redis.url)
-    node = CeleryNode(app, settings, "extractor-1@here", wakeups, dict, asked.set)
+    node = CeleryNode(app, settings, "extractor-1@here", wakeups, dict, arrived.set)
     threads = start_service_threads(node.threads(), stop)
     wakeups.send(message(), replace(message(), queue=WakeupQueue.QUERY))
-    assert asked.wait(SECONDS)
+    assert arrived.wait(SECONDS)
     assert client.llen(WakeupQueue.QUERY) == 0
     assert client.llen(WakeupQueue.BULK) == 1
     assert node.wait(SECONDS), "the query's message ends a pause, too"
