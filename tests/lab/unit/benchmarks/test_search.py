@@ -19,7 +19,6 @@ from lab.benchmarks.search import (
     Ranking,
     SearchMethod,
     compare_methods,
-    measure_growth,
     placewise_search,
     same_ranking,
 )
@@ -112,13 +111,6 @@ def test_whole_run_finds_no_wrong_answer_and_measures_everything(tmp_path: Path)
     assert not any(row["wrong"] for row in comparison["rows"])
     assert not list(tmp_path.iterdir()), "what was made is removed"
 
-
-def test_growth_is_measured_by_the_size_of_the_map() -> None:
-    report = Report("anything")
-    with Progress(disable=True) as progress:
-        measure_growth(report, progress, sizes=[3000])
-    figures = {figure.what: figure.measured for figure in report.figures}
-    assert figures["growth: scan of 3,000 codes, p50"] > 0
 
 
 def test_a_wrong_answer_of_ours_is_a_missed_figure(tmp_path: Path) -> None:
