@@ -24,6 +24,7 @@ from sqlalchemy.orm import configure_mappers
 
 import services.cli
 from services.cli import collection_paused
+from services.search.sign_code_search import compile_kernels
 from shared.config.settings import Settings
 from tools.make_api_page import openapi_description
 
@@ -55,6 +56,10 @@ MODULES = (
     "uvicorn.lifespan.on",
     "uvicorn.loops.auto",
     "uvicorn.protocols.http.h11_impl",
+    # What tests import.
+    "hypothesis",
+    "pycolmap",
+    "schemathesis",
 )
 REQUEST_BYTES = 128 * 1024  # an environment has a few KiB
 
@@ -161,6 +166,7 @@ def _import() -> None:
     Settings()
     configure_mappers()
     openapi_description()  # works out all routes
+    compile_kernels()
 
 
 def main() -> None:
