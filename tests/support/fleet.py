@@ -38,8 +38,7 @@ from tests.support.servers import (
     start_redis,
     start_s3,
 )
-from tests.support.servers.daemon import cpu_seconds_of, free_ports
-from tests.support.servers.handle import Handle
+from tests.support.servers.daemon import Daemon, cpu_seconds_of, free_ports
 
 START_TIMEOUT_SECONDS = 120.0
 STOP_TIMEOUT_SECONDS = 60.0
@@ -54,7 +53,7 @@ class Servers:
     postgres: PostgresServer
     redis: RedisServer
     s3: S3Server
-    processes: dict[str, Handle]
+    processes: dict[str, Daemon]
     """By name: PostgreSQL, Redis, the S3 store"""
     proxies: dict[str, FaultProxy]
     """By the same names; services may connect through them"""
