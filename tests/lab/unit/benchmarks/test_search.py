@@ -63,13 +63,6 @@ def test_descriptors_have_the_structure_of_vlad() -> None:
     assert best[:, 9].max() < 0.25
 
 
-def test_the_same_seed_makes_the_same_city_whatever_the_chunks() -> None:
-    one = np.concatenate(list(SyntheticCity(512, 1).chunks(600, 100)))
-    other = np.concatenate(list(SyntheticCity(512, 1).chunks(600, 1000)))
-    np.testing.assert_array_equal(one, other)
-    assert not np.array_equal(one, np.concatenate(list(SyntheticCity(512, 2).chunks(600, 1000))))
-
-
 def test_brute_force_orders_equal_photos_by_their_ids() -> None:
     rows = rows_of(1, 6)
     rows[4] = rows[1]
