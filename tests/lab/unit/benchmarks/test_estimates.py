@@ -14,10 +14,7 @@ from typer.testing import CliRunner
 from lab.benchmarks import estimates
 from lab.benchmarks.estimates import (
     DescribedPhotos,
-    add_left_out,
-    left_out_labels,
 )
-from lab.benchmarks.report import Report
 from services.cli.main import build_app
 from shared.errors import Misconfigured
 from shared.evaluation.places.evidence import PhotoLocation
@@ -80,14 +77,3 @@ def test_without_a_folder_the_tower_of_the_test_data_is_measured(
     monkeypatch.delenv("PLACEWISE_TEST_DATA")
     with pytest.raises(Misconfigured, match="PLACEWISE_TEST_DATA"):
         estimates.bench()
-
-
-def test_each_floor_is_left_out_once_and_its_photos_get_few_fine_answers() -> None:
-    photos = described()
-    groups = list(left_out_labels(photos))
-    assert np.sum(groups, axis=0).tolist() == [1] * len(photos.rows)
-    report = Report("estimates")
-    add_left_out(report, "house", photos)
-    finest, wrong = (figure.measured for figure in report.figures)
-    assert finest <= 20
-    assert wrong >= finest, "none of these answers can be right"
