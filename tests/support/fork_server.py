@@ -8,6 +8,7 @@ one request at a time and has no threads, as a fork would copy the locks that th
 from __future__ import annotations
 
 import atexit
+import gc
 import importlib
 import json
 import os
@@ -103,6 +104,8 @@ def _answer(client: socket.socket, codes: dict[int, int | None]) -> dict[str, An
         if codes[pid] is None:
             codes[pid] = _exit_code(pid)
         answer = codes[pid]
+    elif "command" not in request:
+        answer = None  # it is ready
     else:
         answer = os.fork()
         for standard, descriptor in enumerate(given):
@@ -171,6 +174,7 @@ def _import() -> None:
 
 def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the tests, which then end this
+    atexit.register(gc.unfreeze)  # or triton would hide an error behind hundreds of "leaks"
     listener = socket.socket(fileno=int(sys.argv[1]))
     with collection_paused():  # which leaves these pages shared with the children's collections
         _import()

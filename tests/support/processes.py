@@ -113,8 +113,11 @@ def forked_program(path: Path, prefix: str = "") -> Path:
 
 
 def forked_command(program: str | Path) -> str:
-    """A shell command that runs this program in Python as a fork."""
-    _fork_server()
+    """A shell command that runs this program in Python as a fork.
+
+    AssertionError with what the fork server has printed if it could not start.
+    """
+    _fork_server().ask({})
     client = Path(__file__).with_name("forked_program.py")
     return shlex.join([sys.executable, "-IS", str(client), ADDRESS[1:], str(program)])
 
