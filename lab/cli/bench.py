@@ -32,7 +32,7 @@ class _BenchmarkGroup(TyperGroup):
     def get_command(self, _ctx: Any, name: str) -> Any:
         if name not in BENCHMARKS:
             return None
-        require_packages("tests", "faiss", "psutil", "pytest")
+        require_packages("tests", "faiss", "psutil", "pytest", "testcontainers")
         module = importlib.import_module(f"lab.benchmarks.{name.replace('-', '_')}")
         benchmark = typer.Typer(add_completion=False)
         benchmark.command(name)(module.bench)

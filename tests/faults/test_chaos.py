@@ -30,7 +30,7 @@ from tests.support.fleet import Fleet, open_fleet
 from tests.support.invariants import count_unfinished_jobs, find_violations
 from tests.support.photos import photo_bytes
 from tests.support.server import SERVICES_KEY
-from tests.support.servers.daemon import Daemon
+from tests.support.servers.handle import Handle
 from tests.support.waiting import wait_until
 
 pytestmark = pytest.mark.timeout(900)
@@ -90,8 +90,8 @@ def _stop(
     title: str,
     server: str,
     seconds: float = FAULT_SECONDS,
-    begin: Callable[[Daemon], object] = Daemon.kill,
-    end: Callable[[Daemon], object] = Daemon.start,
+    begin: Callable[[Handle], object] = Handle.kill,
+    end: Callable[[Handle], object] = Handle.start,
 ) -> Fault:
     return Fault(
         title,
@@ -128,7 +128,7 @@ FAULTS = [
     Fault("FLUSHALL", lambda f: f.servers.redis.flush(), lambda f: f.servers.redis.flush()),
     _stop("Redis stopped", "Redis"),
     _stop("Redis stopped for two minutes", "Redis", 120.0),
-    *(_stop(f"Redis paused {n} s", "Redis", n, Daemon.pause, Daemon.resume) for n in (7, 16, 90)),
+    *(_stop(f"Redis paused {n} s", "Redis", n, Handle.pause, Handle.resume) for n in (7, 16, 90)),
     Fault(
         "Redis full",
         lambda f: f.servers.redis.fill(),

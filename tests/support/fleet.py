@@ -38,7 +38,8 @@ from tests.support.servers import (
     start_redis,
     start_s3,
 )
-from tests.support.servers.daemon import Daemon, cpu_seconds_of, free_ports
+from tests.support.servers.daemon import cpu_seconds_of, free_ports
+from tests.support.servers.handle import Handle
 
 START_TIMEOUT_SECONDS = 120.0
 STOP_TIMEOUT_SECONDS = 60.0
@@ -53,7 +54,7 @@ class Servers:
     postgres: PostgresServer
     redis: RedisServer
     s3: S3Server
-    processes: dict[str, Daemon]
+    processes: dict[str, Handle]
     """By name: PostgreSQL, Redis, the S3 store"""
     proxies: dict[str, FaultProxy]
     """By the same names; services may connect through them"""

