@@ -50,11 +50,6 @@ def test_no_command_imports_a_database_a_server_or_torch_before_it_runs() -> Non
     assert imported.split() == []
 
 
-def test_imported_modules_are_frozen_for_the_garbage_collector() -> None:
-    frozen = "print(gc.get_freeze_count() > 10_000, gc.isenabled())"
-    assert printed_after("maps", "--help", code=frozen).endswith("True True\n")
-
-
 def test_the_version_is_printed_without_importing_a_command() -> None:
     printed = printed_after("--version", code="print('services.cli.query' in sys.modules)")
     assert printed == f"placewise {version('placewise')}\nFalse\n"

@@ -19,12 +19,10 @@ from services.cli.ingest.geotags import (
 )
 from services.cli.locate.sidecars import add_position
 from shared.errors import InvalidRequest
-from shared.utm_filenames import upload_fields_of_file_name
 from tests.support.photos import exif_with_position, photo_bytes
 
 # The Mole Antonelliana in Turin, zone 32T.
 EAST, NORTH = "396544.00", "4991543.00"
-LATITUDE, LONGITUDE = 45.0691, 7.6853
 
 
 def make(folder: Path, *names: str) -> Path:
@@ -45,57 +43,6 @@ def table_of(folder: Path, text: str, encoding: str = "utf-8") -> Path:
     path = folder / "photos.csv"
     path.write_text(text, encoding=encoding)
     return path
-
-
-def test_name_with_latitude_and_longitude_needs_no_zone() -> None:
-    name = f"@{EAST}@{NORTH}@32@T@45.0691@7.6931@pano@tile@370.5@@@@@@.jpg"
-    expected = {"latitude": "45.0691", "longitude": "7.6931", "heading": "10.5"}
-    assert upload_fields_of_file_name(name, None) == expected
-
-
-@pytest.mark.parametrize("zone", [None, "33T"])
-def test_name_with_its_own_zone_goes_before_the_option(zone: str | None) -> None:
-    fields = upload_fields_of_file_name(f"@{EAST}@{NORTH}@32@T@@@@@@@@@@@.jpg", zone)
-    assert float(fields["latitude"]) == pytest.approx(LATITUDE, abs=1e-3)
-    assert float(fields["longitude"]) == pytest.approx(LONGITUDE, abs=1e-3)
-    assert "heading" not in fields
-
-
-@pytest.mark.parametrize(
-    ("name", "zone"),
-    [(f"@{EAST}@{NORTH}@.jpg", "32T"), (f"@{EAST}@{NORTH}@@@@@@@@@@@@@.jpg", "32t")],
-)
-def test_name_without_a_zone_takes_the_option(name: str, zone: str) -> None:
-    fields = upload_fields_of_file_name(name, zone)
-    assert float(fields["latitude"]) == pytest.approx(LATITUDE, abs=1e-3)
-    assert float(fields["longitude"]) == pytest.approx(LONGITUDE, abs=1e-3)
-
-
-def test_name_without_any_zone_is_an_error_that_names_the_option() -> None:
-    with pytest.raises(InvalidRequest) as caught:
-        upload_fields_of_file_name(f"@{EAST}@{NORTH}@@@@@@@@@@@@@.jpg", None)
-    assert caught.value.code == "no_utm_zone"
-    assert "--utm-zone" in caught.value.detail
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        f"@east@{NORTH}@32@T@@@@@@@@@@@.jpg",
-        f"@{EAST}@{NORTH}@99@T@@@@@@@@@@@.jpg",
-        f"@{EAST}@{NORTH}@32@I@@@@@@@@@@@.jpg",
-    ],
-)
-def test_coordinates_that_are_none_are_an_error_that_names_the_file(name: str) -> None:
-    with pytest.raises(InvalidRequest) as caught:
-        upload_fields_of_file_name(name, None)
-    assert caught.value.code == "bad_coordinates"
-    assert name in caught.value.detail
-
-
-@pytest.mark.parametrize("name", ["photo.jpg", "me@home.jpg", "a@1@2@3@4@.jpg", "@me.jpg"])
-def test_ordinary_names_say_nothing(name: str) -> None:
-    assert upload_fields_of_file_name(name, "32T") == {}
 
 
 def test_photos_below_the_folder_are_sorted_by_path_and_hidden_files_are_left_out(
