@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +9,16 @@ from pathlib import Path
 from services.cli.ingest.local_headers import find_sidecars
 from services.cli.locate.folder import read_folder, read_photo
 from services.cli.locate.library import LibraryPhoto, LocatedPhoto, UndoReport, WriteReport
-from services.cli.locate.sidecars import add_position, sidecar_path
-from services.cli.locate.undo_journal import UndoJournal, open_journal, undo
-from services.cli.output import utf8_path
-from shared.errors import PlacewiseError
+from services.cli.locate.sidecars import (
+    add_position,
+    has_estimate,
+    remove_position,
+    replace_sidecar,
+    sidecar_path,
+)
+from services.cli.output import printable_path, refuse_unwritable, utf8_path
+from shared.errors import NotFound, PlacewiseError
 from shared.geotagging.fusion import Proposal
-
-ERRORS_OF_ONE_FILE = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,37 +43,55 @@ class FolderLibrary:
         return self.folder / photo.id
 
     def write(self, located: Sequence[LocatedPhoto]) -> WriteReport:
-        """Write the sidecars, with a journal that undoes it.
-
-        Raises:
-            Misconfigured: `out_unwritable`.
-            Conflict: `locate_in_progress`.
-        """
+        """Write the sidecars; one that can't be written is skipped."""
         report = WriteReport()
-        with open_journal(self.folder) as journal:
-            for location in located:
-                name, photo = location.photo.name, self.folder / location.photo.id
-                if location.proposal is None:
-                    report.skipped[name] = "has a place only, which --json prints"
-                    continue
-                if reason := self._change_meanwhile(photo):
-                    report.skipped[name] = reason
-                    continue
-                try:
-                    path = _write_sidecar(journal, photo, location.proposal)
-                except PlacewiseError as error:
-                    report.skipped[name] = error.detail
-                except OSError as error:
-                    if error.errno not in ERRORS_OF_ONE_FILE:
-                        raise
-                    report.skipped[name] = f"can't be written: {error.strerror}"
-                else:
-                    report.written.append(utf8_path(path.relative_to(self.folder)))
+        for location in located:
+            name, photo = location.photo.name, self.folder / location.photo.id
+            if location.proposal is None:
+                report.skipped[name] = "has a place only, which --json prints"
+                continue
+            if reason := self._change_meanwhile(photo):
+                report.skipped[name] = reason
+                continue
+            try:
+                path = self._write_sidecar(photo, location.proposal)
+            except PlacewiseError as error:
+                report.skipped[name] = error.detail
+            else:
+                report.written.append(utf8_path(path.relative_to(self.folder)))
         return report
 
     def undo(self) -> UndoReport:
-        """Restore the files; see `undo_journal.undo`."""
-        return undo(self.folder)
+        """Take back what `write` has added to the sidecars, byte by byte.
+
+        Raises:
+            NotFound: `nothing_to_undo`.
+            Misconfigured: `out_unwritable`.
+            Unprocessable: As `replace_sidecar` raises it.
+        """
+        report = UndoReport()
+        with refuse_unwritable(self.folder):
+            for path in sorted(self.folder.rglob("*")):
+                if path.suffix.lower() != ".xmp" or not path.is_file():
+                    continue
+                present = path.read_bytes()
+                if not has_estimate(present):
+                    continue
+                name, former = utf8_path(path.relative_to(self.folder)), remove_position(present)
+                if former is None:
+                    path.unlink()
+                    report.removed.append(name)
+                elif former == present:
+                    report.changed_since.append(name)
+                else:
+                    replace_sidecar(self.folder, path, former, present)
+                    report.restored.append(name)
+        if report == UndoReport():
+            raise NotFound(
+                "nothing_to_undo",
+                f"No sidecar below {printable_path(self.folder)} has estimated coordinates.",
+            )
+        return report
 
     def _change_meanwhile(self, photo: Path) -> str | None:
         """Return why a photo needs no position any more; the searches may have taken minutes."""
@@ -81,12 +101,12 @@ class FolderLibrary:
             return "got coordinates meanwhile"
         return None
 
-
-def _write_sidecar(journal: UndoJournal, photo: Path, proposal: Proposal) -> Path:
-    """Add the position to the sidecar of a photo, or to a new one; return its path."""
-    path = next(iter(find_sidecars(photo)), sidecar_path(photo))
-    existing = path.read_bytes() if path.is_file() else None  # reading a FIFO would wait for ever
-    at = proposal.latitude, proposal.longitude
-    content = add_position(existing, *at, proposal.radius_68_m, proposal.heading)
-    journal.write(path, content, existing)
-    return path
+    def _write_sidecar(self, photo: Path, proposal: Proposal) -> Path:
+        """Add the position to the sidecar of a photo, or to a new one; return its path."""
+        path = next(iter(find_sidecars(photo)), sidecar_path(photo))
+        with refuse_unwritable(path):
+            existing = path.read_bytes() if path.is_file() else None
+            at = proposal.latitude, proposal.longitude
+            content = add_position(existing, *at, proposal.radius_68_m, proposal.heading)
+            replace_sidecar(self.folder, path, content, existing)
+        return path

@@ -195,7 +195,7 @@ def test_names_in_a_table_may_be_composed_otherwise_or_have_backslashes(tmp_path
 
 def test_copies_come_after_their_originals(tmp_path: Path) -> None:
     names = ["a.jpg", "a (1).jpg", "a (2).jpg", "a (10).jpg", "a1.jpg"]
-    make(tmp_path, *names, ".placewise-locate/new/a.jpg")
+    make(tmp_path, *names, ".hidden/new/a.jpg")
     assert [path.name for path in list_photos(tmp_path)] == names
 
 
