@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import deque
-from collections.abc import Iterable, Sequence, Sized
+from collections.abc import Iterable, Sized
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,6 +24,8 @@ from services.cli.output import (
     MapOption,
     ServerOption,
     Table,
+    atomic_write,
+    check_output_path,
     format_percent,
     print_json,
     print_note,
@@ -38,12 +40,7 @@ from services.cli.track.frame_sources import (
     read_photo_frames,
     read_video_frames,
 )
-from services.cli.track.track_files import (
-    WRITERS,
-    check_track_files,
-    track_row,
-    write_track_file,
-)
+from services.cli.track.gpx import to_gpx
 from shared.errors import Conflict, InvalidRequest, TooLarge, Unprocessable, UnsupportedMedia
 from shared.tracks.motion import MOTION_MODELS
 
@@ -57,13 +54,7 @@ def track(
         typer.Argument(metavar="SOURCE", exists=True, help="A folder of photos, or a video."),
     ],
     out: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--out",
-            metavar="FILE",
-            help=f"Write the track; the format follows from the extension: {', '.join(WRITERS)}. "
-            "May be repeated.",
-        ),
+        Path | None, typer.Option("--out", metavar="FILE.gpx", help="Write the track as GPX.")
     ] = None,
     motion: Annotated[
         str | None,
@@ -118,8 +109,8 @@ def track(
     The photos are not added to the map. The track stays on the server for some time, where the page
     shows it.
     """
-    files = out or []
-    check_track_files(files)
+    if out is not None:
+        check_output_path(out, ".gpx", "a track")
     timing = FrameTiming(every, order, begin and begin.replace(tzinfo=UTC))
     with (
         connect(server, map_name, key) as client,
@@ -140,12 +131,13 @@ def track(
                 raise
             print_note(error.detail)
             result = client.track(begun.track_id)
-    for file in files:
-        write_track_file(file, result)
+    if out is not None:
+        with atomic_write(out) as file:
+            file.write(to_gpx(result))
     if as_json:
         print_json(result)
     else:
-        _print_track(result, files)
+        _print_track(result, out)
 
 
 def _send_frames(
@@ -205,7 +197,7 @@ def _print_failure(progress: Progress, name: str, problem: dict[str, Any]) -> No
     )
 
 
-def _print_track(track: OneTrack, files: Sequence[Path]) -> None:
+def _print_track(track: OneTrack, out: Path | None) -> None:
     table = Table(
         "time",
         "photo",
@@ -216,20 +208,21 @@ def _print_track(track: OneTrack, files: Sequence[Path]) -> None:
         "place",
     )
     for frame in track.frames:
-        row = track_row(frame)
+        state = frame.state
+        at = state if state is not None and state.latitude is not None else None
         table.add_row(
             f"{frame.captured_at:%H:%M:%S}",
             escape(frame.filename),
-            row["status"],
-            format_percent(row["probability"]),
-            "" if row["latitude"] is None else f"{row['latitude']:.6f}",
-            "" if row["longitude"] is None else f"{row['longitude']:.6f}",
-            escape(row["place"] or ""),
+            state.status if state else frame.status,
+            format_percent(state.probability if state else None),
+            f"{at.latitude:.6f}" if at else "",
+            f"{at.longitude:.6f}" if at else "",
+            escape((state and state.place) or ""),
         )
     print_table(table)
     states = [frame.state for frame in track.frames if frame.state is not None]
     tracked = sum(state.status == "tracking" for state in states)
     print_note(
         f"{tracked} of {len(track.frames)} frames are tracked. Track {track.track_id}"
-        f"{''.join(f', {printable_path(file)}' for file in files)}"
+        + (f", {printable_path(out)}" if out else "")
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import sys
 from datetime import UTC, datetime, timedelta
@@ -24,12 +23,7 @@ from services.cli.track.frame_sources import (
     read_photo_frames,
     read_video_frames,
 )
-from services.cli.track.track_files import (
-    COLUMNS,
-    check_track_files,
-    located_segments,
-    write_track_file,
-)
+from services.cli.track.gpx import GPX_NAMESPACE, located_segments, to_gpx
 from shared.errors import InvalidRequest, Misconfigured
 from tests.support.photos import photo_bytes, photo_image
 
@@ -219,19 +213,9 @@ RIDE = track_of(
 )
 
 
-def test_files_of_a_track_have_its_frames_and_no_line_where_it_is_lost(tmp_path: Path) -> None:
-    names = ("csv", "gpx")
-    files = {name: tmp_path / f"ride.{name}" for name in names}
-    check_track_files(list(files.values()))
-    for file in files.values():
-        write_track_file(file, RIDE)
-    rows = list(csv.DictReader(files["csv"].read_text().splitlines()))
-    assert tuple(rows[0]) == COLUMNS
-    statuses = [row["status"] for row in rows]
-    assert statuses == ["converging", "tracking", "lost", "failed", "tracking"]
-    assert (rows[3]["latitude"], rows[4]["latitude"]) == ("", "45.002")
-    gpx = ElementTree.parse(files["gpx"]).getroot()
-    space = {"g": "http://www.topografix.com/GPX/1/1"}
+def test_a_gpx_track_has_a_segment_for_each_part_that_is_not_lost() -> None:
+    gpx = ElementTree.fromstring(to_gpx(RIDE))
+    space = {"g": GPX_NAMESPACE}
     segments = gpx.findall("g:trk/g:trkseg", space)
     assert [len(segment) for segment in segments] == [2, 1]
     first = segments[0].find("g:trkpt", space)
@@ -239,17 +223,3 @@ def test_files_of_a_track_have_its_frames_and_no_line_where_it_is_lost(tmp_path:
     assert first.attrib == {"lat": "45.0000000", "lon": "7.0000000"}
     assert first.findtext("g:time", namespaces=space) == "2026-05-01T12:00:00Z"
     assert located_segments(track_of(None)) == []
-
-
-def test_csv_cells_are_no_formulas_for_a_spreadsheet(tmp_path: Path) -> None:
-    named = RIDE.frames[0].model_copy(update={"filename": "-1.jpg"})
-    write_track_file(tmp_path / "ride.csv", RIDE.model_copy(update={"frames": [named]}))
-    [row] = csv.DictReader((tmp_path / "ride.csv").read_text().splitlines())
-    assert row["filename"] == "'-1.jpg"
-
-
-def test_files_that_can_not_be_written_are_refused_before_the_work(tmp_path: Path) -> None:
-    for bad in (tmp_path / "ride.txt", tmp_path / "missing" / "ride.csv"):
-        with pytest.raises(InvalidRequest) as refusal:
-            check_track_files([bad])
-        assert refusal.value.code == "bad_out"
