@@ -20,7 +20,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from services.gateway.dependencies import API_PREFIX
 from shared.config.settings import Settings
 from shared.errors import TooLarge
-from shared.http.problem_details import handle_unexpected_error, problem_response
+from shared.http.problem_details import handle_unexpected_error
 
 SECURITY_HEADERS = {
     # API responses are not pages: when a browser displays one, it must not run or load anything.
@@ -101,35 +101,27 @@ class BodySizeLimitMiddleware:
         limit = self._limits.get(scope["path"], MAX_JSON_BYTES)
         max_values = limit // BYTES_PER_VALUE
         size = values = 0
-        error: TooLarge | None = None
 
         async def counted_receive() -> Message:
-            nonlocal size, values, error
+            nonlocal size, values
             message = await receive()
             body = message.get("body", b"")
             size += len(body)
             values += sum(map(body.count, VALUE_MARKS))
             if size > limit:
-                error = TooLarge("body_too_large", f"The body is larger than {limit} bytes.")
-            elif values > max_values:
-                error = TooLarge(
-                    "too_many_values",
-                    f"The body has more than {max_values} values. Split it, or send less.",
-                )
+                raise TooLarge("body_too_large", f"The body is larger than {limit} bytes.")
+            if values > max_values:
                 while message.get("more_body") and size <= limit:
                     # Many clients read no response before they have sent their body.
                     message = await receive()
                     size += len(message.get("body", b""))
-            # The route sees a client disconnect; its response is replaced by the 413.
-            return message if error is None else {"type": "http.disconnect"}
+                raise TooLarge(
+                    "too_many_values",
+                    f"The body has more than {max_values} values. Split it, or send less.",
+                )
+            return message
 
-        async def guarded_send(message: Message) -> None:
-            if error is None:
-                await send(message)
-            elif message["type"] == "http.response.start":
-                await problem_response(error, Request(scope))(scope, receive, send)
-
-        await self._app(scope, counted_receive, guarded_send)
+        await self._app(scope, counted_receive, send)
 
     def _is_exempt(self, scope: Scope) -> bool:
         path = scope["path"]
