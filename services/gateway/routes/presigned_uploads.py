@@ -166,7 +166,7 @@ async def complete_presigned_upload(
 ) -> UploadResponse:
     """Complete a presigned upload: validate the sent file and store the photo.
 
-    The responses are those of `POST /upload`. A repeated request gets the same response again.
+    The responses are those of `POST /upload`. A repeated request gets the job of the first one.
     """
     # Executed once, as a request with an Idempotency-Key is.
     idempotent = IdempotentRequest(gateway, request, response, f"upload-{upload_id}")
@@ -175,12 +175,7 @@ async def complete_presigned_upload(
             _complete_upload, request, gateway, query.map, upload_id, idempotent
         )
     job = await wait_for_description(request, response, gateway, stored)
-    outcome = UploadOutcome.of(stored, job, query.map)
-    if outcome.status == 201:
-        await run_in_threadpool(
-            idempotent.replace_response, outcome.status, outcome.body, outcome.headers
-        )
-    return outcome.send(response)
+    return UploadOutcome.of(stored, job, query.map).send(response)
 
 
 def _complete_upload(
