@@ -1,12 +1,4 @@
-"""ASGI middleware: security headers, the body size limit and the handler of unexpected exceptions.
-
-`SecurityHeadersMiddleware` sets headers on every response, errors included, unless the route has
-set them itself, as the web page on `/` and the API documentation do. `BodySizeLimitMiddleware`
-limits bodies that are read into memory (JSON); forms and manifests are limited by the streaming
-parsers of their routes. `ExceptionHandlerMiddleware` must be inside the middleware that adds
-headers: Starlette's own handler of unexpected exceptions is outside of all middleware, so its
-responses would lack them.
-"""
+"""ASGI middleware: security headers, the size limit of bodies, and unexpected exceptions."""
 
 from __future__ import annotations
 
@@ -14,7 +6,7 @@ import re
 from collections.abc import Container, Mapping
 
 from fastapi import Request
-from starlette.datastructures import MutableHeaders
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from services.gateway.dependencies import API_PREFIX
@@ -36,7 +28,10 @@ PRIVATE_CACHE_CONTROL = "private, no-store"
 
 
 class SecurityHeadersMiddleware:
-    """Adds the security headers, and `Cache-Control` below `/api`, that a response does not set."""
+    """Adds the security headers, and `Cache-Control` below `/api`, that a response does not set.
+
+    Responses of the web page and of the API documentation set their own.
+    """
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         self._app = app
@@ -69,7 +64,7 @@ VALUE_MARKS = (b",", b"[", b"{")
 
 
 class BodySizeLimitMiddleware:
-    """Responds 413 to large bodies without reading the rest.
+    """Refuses large bodies that are read into memory (JSON) without reading the rest.
 
     `body_too_large` for more than MAX_JSON_BYTES, `too_many_values` for more values in them than
     bodies of that size need.
@@ -124,23 +119,17 @@ class BodySizeLimitMiddleware:
         await self._app(scope, counted_receive, send)
 
     def _is_exempt(self, scope: Scope) -> bool:
-        path = scope["path"]
-        if path in self._exempt_paths:
-            return True
-        return _is_multipart(scope) and self._form_paths.fullmatch(path) is not None
-
-
-def _is_multipart(scope: Scope) -> bool:
-    return any(
-        name == b"content-type" and value.lower().startswith(b"multipart/")
-        for name, value in scope["headers"]
-    )
+        path, media_type = scope["path"], Headers(scope=scope).get("content-type", "")
+        is_form = media_type.lower().startswith("multipart/")
+        return path in self._exempt_paths or bool(is_form and self._form_paths.fullmatch(path))
 
 
 class ExceptionHandlerMiddleware:
     """Converts unhandled exceptions into an opaque 500 with the request id.
 
-    If the response has already started, the exception is raised again and closes the connection.
+    It is inside the middleware that adds headers: Starlette's own handler is outside of all
+    middleware, so that its responses would lack them. If the response has already started, the
+    exception is raised again and closes the connection.
     """
 
     def __init__(self, app: ASGIApp) -> None:

@@ -215,7 +215,11 @@ def _store_copy(
         _check_object_size(store.head(source_key), upload)
         store.copy(source_key, key)
     except NotFound:
-        raise _upload_incomplete_error(upload) from None
+        raise Conflict(
+            "upload_incomplete",
+            f"No file was sent for the upload {upload.id} yet. PUT it to the URL of the upload "
+            "first.",
+        ) from None
     with delete_if_refused(store, key):
         photo = _validate_copy(request, gateway, store, key, upload)
         with reserve_photo_quota(request, gateway.settings), gateway.catalog.write() as session:
@@ -261,13 +265,6 @@ def _check_object_size(info: ObjectInfo | None, upload: PresignedUpload) -> None
             f"The file that was sent has {info.size_bytes} bytes, not {upload.size_bytes}. Send "
             "the announced file again to the same URL, or start a new upload.",
         )
-
-
-def _upload_incomplete_error(upload: PresignedUpload) -> Conflict:
-    return Conflict(
-        "upload_incomplete",
-        f"No file was sent for the upload {upload.id} yet. PUT it to the URL of the upload first.",
-    )
 
 
 def _parse_photo_fields(values: dict[str, Any]) -> PhotoFields:
