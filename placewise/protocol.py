@@ -104,12 +104,7 @@ def open_file(file: Path) -> Iterator[BinaryIO]:
         with file.open("rb") as stream:
             yield stream
     except OSError as error:
-        raise unreadable_file_error(file, error) from error
-
-
-def unreadable_file_error(file: Path, error: OSError) -> InvalidRequest:
-    """The error of a file that can't be read."""
-    return InvalidRequest("unreadable_file", f"Can't read {file}: {error.strerror}")
+        raise InvalidRequest("unreadable_file", f"Can't read {file}: {error.strerror}") from error
 
 
 def printable_name(file: Path) -> str:

@@ -14,9 +14,9 @@ from PIL.ExifTags import IFD, Base
 
 from services.cli.immich import api
 from services.cli.immich.library import ImmichLibrary
+from services.cli.locate.folder import FolderLibrary
 from services.cli.locate.library import LibraryPhoto, LocatedPhoto, PhotoLibrary
 from services.cli.locate.sidecars import METHOD
-from services.cli.locate.writers import FolderLibrary
 from shared.errors import NotFound
 from shared.geotagging.fusion import Proposal
 from shared.imaging.xmp import EXIF, RDF

@@ -19,7 +19,8 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 from typer.testing import CliRunner, Result
 
-from services.cli.locate import preview, writers
+from services.cli.locate import folder as locate_folder
+from services.cli.locate import preview
 from services.cli.locate.folder import read_folder, read_gpx
 from services.cli.locate.sidecars import NEW_SIDECAR, add_position
 from services.cli.main import build_app
@@ -407,7 +408,7 @@ def test_a_sidecar_that_is_changed_while_it_is_written_keeps_the_change(
         sidecar.write_bytes(SIDECAR)
         return add_position(*arguments)
 
-    monkeypatch.setattr(writers, "add_position", add_slowly)
+    monkeypatch.setattr(locate_folder, "add_position", add_slowly)
     result = run(folder, "--write")
     assert (result.exit_code, "changed the file meanwhile" in result.stderr) == (1, True)
     assert sidecar.read_bytes() == SIDECAR
