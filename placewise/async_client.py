@@ -98,9 +98,8 @@ class AsyncClient(AsyncTransport):
 
         Each manifest entry contains an object `key` and fields of `upload`; bytes are JSONL.
         """
-        body = manifest if isinstance(manifest, bytes) else to_jsonl(manifest)
-        headers = {"Content-Type": "application/x-ndjson"}
-        return await self._start_batch(content=body, headers=headers)
+        data = manifest if isinstance(manifest, bytes) else to_jsonl(manifest)
+        return await self._start_batch(files={"manifest": ("manifest.jsonl", data)})
 
     async def sync_library(self, *, every_hours: int | None = None) -> answers.Started:
         """Bring the map up to date with the photo library of the server's settings.

@@ -112,7 +112,6 @@ def create_app(gateway: GatewayContext) -> FastAPI:
     app.add_middleware(
         BodySizeLimitMiddleware,
         form_paths=form_paths(),
-        exempt_paths={f"{API_PREFIX}{batches.BATCH_UPLOAD_PATH}"},
         limits={
             f"{API_PREFIX}{places.PROPOSALS_PATH}": positions.MAX_BODY_BYTES,
             f"{API_PREFIX}{positions.POSITIONS_PATH}": positions.MAX_BODY_BYTES,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Container, Mapping
+from collections.abc import Mapping
 
 from fastapi import Request
 from starlette.datastructures import Headers, MutableHeaders
@@ -72,7 +72,6 @@ class BodySizeLimitMiddleware:
     Args:
         form_paths: Matches the paths of the routes that limit multipart bodies themselves. Any
             other route would read such a body into memory.
-        exempt_paths: Paths of the routes that limit all their bodies themselves.
         limits: Other limits than MAX_JSON_BYTES, by path.
     """
 
@@ -81,12 +80,10 @@ class BodySizeLimitMiddleware:
         app: ASGIApp,
         *,
         form_paths: re.Pattern[str],
-        exempt_paths: Container[str],
         limits: Mapping[str, int],
     ) -> None:
         self._app = app
         self._form_paths = form_paths
-        self._exempt_paths = exempt_paths
         self._limits = limits
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -119,9 +116,9 @@ class BodySizeLimitMiddleware:
         await self._app(scope, counted_receive, send)
 
     def _is_exempt(self, scope: Scope) -> bool:
-        path, media_type = scope["path"], Headers(scope=scope).get("content-type", "")
+        media_type = Headers(scope=scope).get("content-type", "")
         is_form = media_type.lower().startswith("multipart/")
-        return path in self._exempt_paths or bool(is_form and self._form_paths.fullmatch(path))
+        return is_form and self._form_paths.fullmatch(scope["path"]) is not None
 
 
 class ExceptionHandlerMiddleware:

@@ -144,12 +144,6 @@ def _malformed_body_error(reason: str) -> PlacewiseError:
     return InvalidRequest("malformed_body", f"The multipart body can't be read: {reason}.")
 
 
-def body_media_type(request: Request) -> str:
-    """Return the media type of the body in lower case, without parameters; "" if not given."""
-    media_type, _ = parse_options_header(request.headers.get("content-type", ""))
-    return media_type.decode("latin-1").lower()
-
-
 def _parse_boundary(request: Request) -> bytes:
     media_type, options = parse_options_header(request.headers.get("content-type", ""))
     if media_type != b"multipart/form-data":
