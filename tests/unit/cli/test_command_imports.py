@@ -35,7 +35,7 @@ def printed_after(*arguments: str, code: str) -> str:
 def test_the_help_of_the_program_imports_no_command_and_names_each_as_the_command_does() -> None:
     own = "print(*[name for name in sys.modules if name.startswith('services.cli.')])"
     overview, imported = printed_after("--help", code=own).rstrip("\n").rsplit("\n", 1)
-    assert imported == "services.cli.main services.cli.help_layout"
+    assert imported == "services.cli.main"
     complete = CliRunner().invoke(build_app(), ["--help"], prog_name="placewise")
     assert overview.split() == complete.output.split()
 
