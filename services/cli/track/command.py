@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterable, Sized
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 from uuid import UUID
 
 import typer
@@ -29,6 +29,7 @@ from services.cli.output import (
     format_percent,
     print_json,
     print_note,
+    print_problem,
     print_table,
     printable_path,
     progress_bar,
@@ -168,33 +169,26 @@ def _send_frames(
         except (Unprocessable, UnsupportedMedia, TooLarge) as error:
             if error.code == "invalid_field":
                 raise
-            _print_failure(progress, frame.name, error.as_problem())
+            print_problem(error.code, frame.name, error.detail)
             progress.advance(bar)
             continue
         version = sent.version
         ahead.append(sent)
         if len(ahead) > FRAMES_AHEAD:
-            _wait_for_frame(client, track_id, ahead.popleft(), progress)
+            _wait_for_frame(client, track_id, ahead.popleft())
             progress.advance(bar)
     for sent in ahead:
-        _wait_for_frame(client, track_id, sent, progress)
+        _wait_for_frame(client, track_id, sent)
         progress.advance(bar)
     if not version:
         raise InvalidRequest("no_frames", "No frame could be sent.")
 
 
-def _wait_for_frame(client: Client, track_id: UUID, frame: TrackFrame, progress: Progress) -> None:
+def _wait_for_frame(client: Client, track_id: UUID, frame: TrackFrame) -> None:
     while frame.status == "pending":
         frame = client.track_frame(track_id, frame.frame_id, wait_seconds=WAIT_SECONDS)
     if frame.error is not None:
-        _print_failure(progress, frame.filename, frame.error)
-
-
-def _print_failure(progress: Progress, name: str, problem: dict[str, Any]) -> None:
-    progress.console.print(
-        f"[red]{problem['code']}[/red] {escape(name)}: {escape(str(problem['detail']))}",
-        soft_wrap=True,
-    )
+        print_problem(frame.error["code"], frame.filename, frame.error["detail"])
 
 
 def _print_track(track: OneTrack, out: Path | None) -> None:
