@@ -44,7 +44,7 @@ def test_a_folder_of_photos_becomes_a_track_and_its_files(
     for number in FRAMES:
         (tmp_path / "ride" / f"{number}.jpg").write_bytes(photo_bytes(number))
     (tmp_path / "ride" / "4.jpg").write_bytes(photo_bytes(4)[:300])
-    options = ["--every", "10", "--max-speed", "20", "--order", "name"]
+    options = ["--every", "10", "--max-speed", "20"]
     run = run_command(
         *("track", "ride", *options, "--out=ride.gpx", "--json"),
         env=environment(server.home),

@@ -36,7 +36,6 @@ from services.cli.output import (
 )
 from services.cli.track.frame_sources import (
     FrameTiming,
-    Order,
     SourceFrame,
     read_photo_frames,
     read_video_frames,
@@ -71,13 +70,6 @@ def track(
             help="Seconds between two frames of a video, and between photos without a time.",
         ),
     ] = 1.0,
-    order: Annotated[
-        Order | None,
-        typer.Option(
-            help="Order of the photos. Default: by their EXIF times if all have one, otherwise by "
-            "their names."
-        ),
-    ] = None,
     begin: Annotated[
         datetime | None,
         typer.Option(
@@ -107,12 +99,13 @@ def track(
 ) -> None:
     """Follow the camera that took the photos or the video in SOURCE through a map, frame by frame.
 
-    The photos are not added to the map. The track stays on the server for some time, where the page
+    Photos are in the order of their EXIF times if all have one, otherwise of their names. They are
+    not added to the map. The track stays on the server for some time, where the page
     shows it.
     """
     if out is not None:
         check_output_path(out, ".gpx", "a track")
-    timing = FrameTiming(every, order, begin and begin.replace(tzinfo=UTC))
+    timing = FrameTiming(every, begin and begin.replace(tzinfo=UTC))
     with (
         connect(server, map_name, key) as client,
         progress_bar() as progress,

@@ -19,7 +19,6 @@ from PIL.ExifTags import IFD, Base
 from placewise.answers import OneTrack
 from services.cli.track.frame_sources import (
     FrameTiming,
-    Order,
     read_photo_frames,
     read_video_frames,
 )
@@ -28,7 +27,7 @@ from shared.errors import InvalidRequest, Misconfigured
 from tests.support.photos import photo_bytes, photo_image
 
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
-UNKNOWN = FrameTiming(every_seconds=2.0, order=None, begin=None)
+UNKNOWN = FrameTiming(every_seconds=2.0, begin=None)
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -61,11 +60,8 @@ def test_photos_without_a_time_are_in_the_order_of_their_names(tmp_path: Path) -
     frames = read_photo_frames(tmp_path, UNKNOWN)
     assert [frame.name for frame in frames] == ["a.jpg", "b.jpg", "c.jpg"]
     assert [(frame.captured_at - EPOCH).total_seconds() for frame in frames] == [0, 2, 4]
-    later = FrameTiming(1.0, Order.NAME, NOON + timedelta(days=1))
+    later = FrameTiming(1.0, NOON + timedelta(days=1))
     assert read_photo_frames(tmp_path, later)[1].captured_at == NOON + timedelta(days=1, seconds=1)
-    with pytest.raises(InvalidRequest, match=r"a\.jpg has no capture time") as refusal:
-        read_photo_frames(tmp_path, FrameTiming(1.0, Order.TIME, None))
-    assert refusal.value.code == "no_times"
 
 
 def write_video(path: Path, recorded: datetime | None = None) -> Path:
@@ -104,7 +100,7 @@ def test_a_video_has_its_own_clock_which_is_named(
     words: str,
 ) -> None:
     path = write_video(tmp_path / "copied.mp4", recorded)
-    frames = list(read_video_frames(path, FrameTiming(1.0, None, begin), tmp_path))
+    frames = list(read_video_frames(path, FrameTiming(1.0, begin), tmp_path))
     assert [frame.captured_at for frame in frames] == [
         first + timedelta(seconds=seconds) for seconds in range(3)
     ]
@@ -115,7 +111,7 @@ def test_a_video_has_its_own_clock_which_is_named(
 def test_a_video_gives_a_frame_every_so_many_seconds(
     video: Path, tmp_path: Path, every: float, seconds: list[float]
 ) -> None:
-    frames = list(read_video_frames(video, FrameTiming(every, None, NOON), tmp_path))
+    frames = list(read_video_frames(video, FrameTiming(every, NOON), tmp_path))
     assert [(f.captured_at - NOON).total_seconds() for f in frames] == pytest.approx(seconds)
     shades = [np.asarray(Image.open(frame.path)).mean() for frame in frames]
     assert shades == pytest.approx([40, 100, 160], abs=8)
