@@ -109,7 +109,8 @@ def export_descriptors(
                 yield bytes(-size_bytes % tarfile.BLOCKSIZE)
             yield bytes(2 * tarfile.BLOCKSIZE)
 
-    length = sum(_padded_to_block(size_bytes) + tarfile.BLOCKSIZE for _, size_bytes in members)
+    block = tarfile.BLOCKSIZE
+    length = sum(block + size_bytes + -size_bytes % block for _, size_bytes in members)
     return StreamingResponse(
         stream(),
         media_type="application/x-tar",
@@ -177,7 +178,3 @@ def _read_blocks(file: IO[bytes]) -> Iterator[bytes]:
     file.seek(0)
     while piece := file.read(STREAM_READ_BYTES):
         yield piece
-
-
-def _padded_to_block(size_bytes: int) -> int:
-    return size_bytes + -size_bytes % tarfile.BLOCKSIZE
