@@ -17,6 +17,8 @@ from services.cli.main import build_app
 from shared.descriptors import weight_files
 from shared.descriptors.backbones import torchhub as torchhub_module
 from shared.descriptors.backbones.dinov2 import SHAPES
+from tests.support.api_responses import JOB
+from tests.support.fake_server import running_server
 from tests.support.files_server import FilesServer, files_server
 from tests.support.hub import COMMIT, write_hub
 from tests.support.vit import random_weights, save
@@ -180,3 +182,27 @@ def test_fetch_prints_the_setting_that_allows_the_code(caches: Path) -> None:
 def test_an_extractor_for_tests_has_nothing_to_fetch() -> None:
     assert command("fetch", "test-tiny-avg", exit_code=1)["code"] == "no_weights"
     assert command("fetch", "anyloc", exit_code=1)["code"] == "unknown_extractor"
+
+
+def test_a_checkpoint_is_uploaded_under_the_name_of_its_file(tmp_path: Path) -> None:
+    checkpoint = tmp_path / "best.ckpt"
+    checkpoint.write_bytes(b"w" * 300_000)
+    made = {"extractor": "gsv:lab", "dimension": 512, "size_bytes": 1, "fingerprint": "f" * 64}
+    with running_server() as gateway:
+        gateway.will_answer(200, {"models": []})
+        started = {
+            "job_id": JOB["job_id"],
+            "status": "queued",
+            "status_url": "",
+            "result_url": None,
+        }
+        gateway.will_answer(202, started)
+        ended = {**JOB, "state": "succeeded", "result": {**made, "already_there": False}}
+        gateway.will_answer(200, ended)
+        arguments = ["models", "add", str(checkpoint), "--name", "lab", "--server", gateway.url]
+        result = CliRunner().invoke(build_app(["models"]), arguments)
+    assert result.exit_code == 0, result.output
+    assert "gsv:lab: 512 dimensions" in result.stdout
+    body = gateway.requests[1][2]
+    assert checkpoint.read_bytes() in body
+    assert b'filename="best.ckpt"' in body
