@@ -67,7 +67,6 @@ def test_whole_run_finds_no_wrong_answer_and_measures_everything(tmp_path: Path)
     assert not list(tmp_path.iterdir()), "what was made is removed"
 
 
-
 def test_a_wrong_answer_of_ours_is_a_missed_figure(tmp_path: Path) -> None:
     def with_last_two_exchanged(worker: SearchWorker, snapshot: Snapshot) -> SearchMethod:
         right = placewise_search(worker, snapshot)
