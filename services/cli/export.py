@@ -22,6 +22,7 @@ from rich.progress import Progress
 from placewise.answers import Photo
 from placewise.client import Client
 from services.cli.client import active_generation, connect
+from services.cli.ingest.photo_archive import unpack_tar
 from services.cli.output import (
     Json,
     JsonOption,
@@ -153,7 +154,7 @@ def colmap(
         made = client.reconstruction()
         receive = partial(client.export_colmap, made.reconstruction_id)
         with _received_tar(out, receive, progress) as tar:
-            tar.extractall(out, filter="data")
+            unpack_tar(tar, out)
     photos = sum(component.photos for component in made.components)
     folder = printable_path(out)
     print_result(

@@ -53,7 +53,7 @@ def unpack_archive(path: Path, folder: Path) -> Path | None:
                 zipped.extractall(folder)  # noqa: S202 keeps names inside the folder
         else:
             with tarfile.open(path, encoding="utf-8", errors="replace") as tar:
-                _unpack_tar(tar, folder)
+                unpack_tar(tar, folder)
     except READ_ERRORS as error:
         raise InvalidRequest(
             "unreadable_file",
@@ -78,7 +78,7 @@ def _open_zip(path: Path) -> zipfile.ZipFile:
     return zipfile.ZipFile(path)
 
 
-def _unpack_tar(tar: tarfile.TarFile, folder: Path) -> None:
+def unpack_tar(tar: tarfile.TarFile, folder: Path) -> None:
     """Write the files below the folder, whatever their names; Python has filters since 3.11.4."""
     for member in tar:
         if member.size < 0:  # `tarfile` would read the same members for ever
