@@ -171,7 +171,6 @@ def _own_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PLACEWISE_HOME", str(tmp_path / "home"))
     monkeypatch.setenv("ALLOW_TEST_EXTRACTORS", "true")
     monkeypatch.setenv("EXTRACTOR", "test-tiny-avg")
-    monkeypatch.setenv("POOL_WITHOUT_VOCABULARY", "false")
     monkeypatch.setitem(Settings.model_config, "env_file", None)
 
 

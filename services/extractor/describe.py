@@ -19,11 +19,7 @@ from numpy.typing import NDArray
 from sqlalchemy import select
 
 from services.extractor.decoder_process import StoredPhoto
-from services.extractor.generation_resolver import (
-    ResolvedGeneration,
-    requeue_until_vocabulary,
-    resolve_generation,
-)
+from services.extractor.generation_resolver import ResolvedGeneration, resolve_generation
 from services.extractor.handlers import ExtractorContext, JobBatch, handles
 from services.extractor.local_features import BatchFeatures, prepare_features
 from services.extractor.publish import photo_id_of, publish
@@ -50,9 +46,6 @@ PREVIEWS_BY_KIND = {JobKind.INDEX: Previews.ALL, JobKind.DESCRIBE: Previews.OTHE
 def describe_photos(context: ExtractorContext, batch: JobBatch) -> Iterator[None]:
     """Prepare, describe and publish the photos of claimed jobs."""
     target = resolve_generation(context, batch.jobs[0])
-    if target is None:
-        requeue_until_vocabulary(context.catalog, batch)
-        return
     features = prepare_features(context, batch, target)
     photos = _read_rows(context, batch, target, features) or _read_photos(
         context, batch, target, features

@@ -17,7 +17,7 @@ from uuid import UUID
 
 from sqlalchemy import select
 
-from services.extractor.handlers import ExtractorContext, JobBatch
+from services.extractor.handlers import ExtractorContext
 from services.extractor.model_registry import (
     DescriptorPipeline,
     ModelRegistry,
@@ -27,7 +27,6 @@ from services.extractor.model_registry import (
 from shared.catalog.database.base import db_now
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, active_generation
-from shared.catalog.jobs import WaitingFor
 from shared.catalog.maps import Map, Matching, increment_map_version, lock_map
 from shared.catalog.vocabularies import VocabularyOrigin, add_vocabulary
 from shared.descriptors.extractor import Extractor, spec_fingerprint
@@ -36,9 +35,7 @@ from shared.errors import Conflict, PlacewiseError
 from shared.extractor_config.configs import pooled_config
 from shared.ids import new_id
 from shared.jobs import Job, JobKind
-from shared.jobs.leases import lock_leased_jobs
-from shared.jobs.model_changes import start_reindex, wake_vocabulary_waiters
-from shared.jobs.transitions import fail_job, requeue_job
+from shared.jobs.model_changes import start_reindex
 from shared.storage.keys import new_vocabulary_key
 
 log = logging.getLogger(__name__)
@@ -52,12 +49,11 @@ class ResolvedGeneration(DescriptorPipeline):
     matching: Matching  # of the map
 
 
-def resolve_generation(context: ExtractorContext, job: Job) -> ResolvedGeneration | None:
-    """Return the generation for the batch of `job`; None while the map waits for a vocabulary.
+def resolve_generation(context: ExtractorContext, job: Job) -> ResolvedGeneration:
+    """Return the generation for the batch of `job`.
 
     A job that names a generation gets that one; other jobs get the map's active one, which is
-    created on first use if the extractor ships a vocabulary or needs none, and with GeM pooling
-    under POOL_WITHOUT_VOCABULARY.
+    created on first use: with GeM pooling if the extractor needs a vocabulary and ships none.
 
     Raises:
         Unavailable: `spec_differs` if this worker can't reproduce the generation's spec.
@@ -71,8 +67,6 @@ def resolve_generation(context: ExtractorContext, job: Job) -> ResolvedGeneratio
     if generation is None:
         extractor = context.models.extractor(map_.extractor)
         generation = _create_first_generation(context, extractor, job.map_id)
-        if generation is None:
-            return None
     pipeline = context.models.pipeline_of_generation(context.catalog, generation)
     target = ResolvedGeneration(
         pipeline.extractor,
@@ -88,19 +82,16 @@ def resolve_generation(context: ExtractorContext, job: Job) -> ResolvedGeneratio
 
 def _create_first_generation(
     context: ExtractorContext, extractor: Extractor, map_id: UUID
-) -> Generation | None:
+) -> Generation:
     """Create the map's first generation, with the shipped vocabulary if one is needed.
 
     If none is shipped, the generation's extractor pools the same local features, while the map
     keeps its own, with which the vocabulary is fitted later.
 
-    Returns None if the map waits for a vocabulary instead (POOL_WITHOUT_VOCABULARY=false); the
-    existing generation if another worker has created it meanwhile.
+    Returns the existing generation if another worker has created it meanwhile.
     """
     shipped = extractor.shipped_vocabulary()
     if extractor.config.needs_vocabulary and shipped is None:
-        if not context.settings.pool_without_vocabulary:
-            return None
         extractor = context.models.extractor(pooled_config(extractor.config).name)
     key = new_vocabulary_key()
     if shipped is not None:
@@ -134,29 +125,9 @@ def _create_first_generation(
         )
         session.add(generation)
         session.flush()
-        wake_vocabulary_waiters(session, map_id)
         increment_map_version(session, map_id)
     log.info("generation %s created with extractor %s", generation.id, extractor.config.name)
     return generation
-
-
-def requeue_until_vocabulary(catalog: Catalog, batch: JobBatch) -> None:
-    """Requeue claimed photos until the map has a vocabulary; fail queries."""
-    error = Conflict(
-        "no_vocabulary",
-        "The map's extractor needs a vocabulary, but the map has none yet. Fit one on its photos "
-        "(POST /api/v1/vocabularies) or import one (POST /api/v1/vocabularies/import).",
-    )
-    map_id = batch.jobs[0].map_id
-    with catalog.write() as session:
-        lock_map(session, map_id)
-        has_generation = active_generation(session, map_id) is not None
-        for job in lock_leased_jobs(session, batch.token, batch.jobs):
-            if job.kind == JobKind.DESCRIBE and not has_generation:
-                fail_job(job, error.as_problem())
-            else:
-                requeue_job(job, waiting_for=None if has_generation else WaitingFor.VOCABULARY)
-    batch.outcomes["waiting"] = len(batch.jobs)
 
 
 def reindex_outdated_generations(catalog: Catalog, models: ModelRegistry) -> int:

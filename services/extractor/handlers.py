@@ -41,7 +41,7 @@ class JobBatch(ClaimedJobs):
     stages: Iterator[None] = field(default_factory=lambda: iter(()))
     """The running handler."""
     outcomes: Counter[str] = field(default_factory=Counter)
-    """Number of jobs that succeeded, failed, were lost (taken over or cancelled) or are waiting."""
+    """Number of jobs that succeeded, failed or were lost (taken over or cancelled)."""
     seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
     """Duration of each step."""
 

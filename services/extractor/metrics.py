@@ -51,7 +51,7 @@ class ExtractorMetrics:
         self._jobs = counter(
             "jobs",
             "Claimed jobs by outcome. lost: the lease was taken over, or the job was cancelled; "
-            "paused, waiting, requeued: back in the queue; refused: failed, or back in the queue "
+            "paused, requeued: back in the queue; refused: failed, or back in the queue "
             "until an operator acts; crashed: back in the queue, alone.",
             ["kind", "outcome"],
         )

@@ -38,16 +38,15 @@ from services.extractor.handlers import HANDLERS, ExtractorContext, JobBatch
 from services.extractor.metrics import ExtractorMetrics
 from services.extractor.model_registry import ModelRegistry
 from shared.catalog.database.session import Catalog
-from shared.catalog.jobs import DRAINED_JOBS, SINGLE_CLAIM_JOBS, WaitingFor
+from shared.catalog.jobs import DRAINED_JOBS, SINGLE_CLAIM_JOBS
 from shared.catalog.processes import PROCESS_HEARTBEAT_SECONDS, list_processes
 from shared.config.settings import Settings
 from shared.descriptors.extractor import choose_device
 from shared.errors import PlacewiseError
-from shared.jobs import Job, Priority, Wakeups
+from shared.jobs import Priority, Wakeups
 from shared.jobs.claim import fair_batch_size, mark_started
 from shared.jobs.queue_depth import PolledValue
 from shared.jobs.runner import IDLE_POLL_SECONDS, JobRunner
-from shared.jobs.transitions import make_waiting_jobs_claimable
 from shared.storage import ObjectStore
 from shared.telemetry.heartbeat import Heartbeat
 
@@ -134,17 +133,10 @@ class ExtractorWorker:
         return self.context.models.state
 
     def warm_up(self, stop: threading.Event) -> None:
-        """Load the extractor of new maps, so that the first photo does not wait for it.
-
-        Photos that wait for a vocabulary since POOL_WITHOUT_VOCABULARY was off wait no longer.
-        """
+        """Load the extractor of new maps, so that the first photo does not wait for it."""
         self._stop = stop
-        settings = self.context.settings
-        if settings.pool_without_vocabulary:
-            with self.context.catalog.write() as session:
-                make_waiting_jobs_claimable(session, Job.waiting_for == WaitingFor.VOCABULARY)
         try:
-            self.context.models.extractor(settings.new_map_extractor)
+            self.context.models.extractor(self.context.settings.new_map_extractor)
         except PlacewiseError as error:
             # Not fatal: maps may use another extractor, and jobs that need this one report it.
             log.error("the extractor of new maps can't be loaded: %s: %s", error.code, error.detail)

@@ -24,10 +24,8 @@ from uuid import UUID
 import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.database.base import Base, JsonValue, count_rows, for_update, partial_index
-from shared.catalog.generations import active_generation
-from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState, Priority, WaitingFor
-from shared.catalog.maps import lock_map
+from shared.catalog.database.base import Base, JsonValue, count_rows, partial_index
+from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState, Priority
 from shared.ids import new_id
 
 ITEMS_PER_STATEMENT = 1000  # rows inserted, or jobs selected, by one statement
@@ -143,10 +141,7 @@ def list_batch_items(
 
 
 def count_queued_photos(session: Session, limit: int) -> int:
-    """Count the photos that are queued for the extractors, up to `limit`.
-
-    Photos that wait for a vocabulary don't count: a fit may need more of them.
-    """
+    """Count the photos that are queued for the extractors, up to `limit`."""
     waiting = sa.select(Job.id).where(
         Job.state.in_(UNFINISHED_STATES),
         Job.lease_token.is_(None),
@@ -212,31 +207,3 @@ def summarise_batch(session: Session, job: Job, counts: Counter[JobState]) -> di
         "already_there": count_rows(session, already_there),
         "ignored": job.params.get("ignored", 0),
     }
-
-
-def is_waiting_for_vocabulary(session: Session, job: Job) -> bool:
-    """Return whether all running items wait for a vocabulary that the map does not have.
-
-    The caller holds the map's lock, so that a vocabulary added later wakes the batch.
-    """
-    if active_generation(session, job.map_id) is not None:
-        return False
-    other = (
-        sa.select(BatchItem.number)
-        .join(Job, Job.id == BatchItem.photo_job_id)
-        .where(
-            BatchItem.job_id == job.id,
-            BatchItem.state == JobState.RUNNING,
-            sa.or_(Job.waiting_for.is_(None), Job.waiting_for != WaitingFor.VOCABULARY),
-        )
-        .limit(1)
-    )
-    return session.scalar(other) is None
-
-
-def lock_batch(session: Session, job: Job, token: UUID) -> Job | None:
-    """Lock the map, then the batch; return the batch if it is still under the token."""
-    lock_map(session, job.map_id)
-    return session.scalar(
-        for_update(sa.select(Job).where(Job.id == job.id, Job.lease_token == token))
-    )

@@ -136,7 +136,6 @@ class Priority(IntEnum):
 
 
 class WaitingFor(StrEnum):
-    VOCABULARY = "vocabulary"  # the map's extractor needs one, and the map has none yet
     DESCRIPTORS = "descriptors"  # every photo has to be described into the new generation
     SEARCH = "search"  # every live search worker has to load the new generation
     DISK_SPACE = "disk_space"  # a batch: the disk or the bucket is full

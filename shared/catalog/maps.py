@@ -44,7 +44,7 @@ from shared.catalog.generations import (
     RowType,
     active_generation,
 )
-from shared.catalog.jobs import Job, WaitingFor
+from shared.catalog.jobs import Job
 from shared.catalog.photos import (
     Photo,
     PhotoRole,
@@ -147,13 +147,6 @@ def list_extractors_in_use(session: Session) -> set[str]:
             )
         ),
     }
-
-
-def list_maps_without_vocabulary(session: Session) -> list[str]:
-    """Return the names of the maps that have jobs waiting for a vocabulary."""
-    waiting = sa.exists().where(Job.map_id == Map.id, Job.waiting_for == WaitingFor.VOCABULARY)
-    names = sa.select(Map.name).where(Map.deleted_at.is_(None), waiting).order_by(Map.name)
-    return list(session.scalars(names))
 
 
 def count_failed_photos(session: Session) -> dict[str, int]:

@@ -98,11 +98,6 @@ class ExtractorSettings(BaseSettings):
         description="number of decoding processes, unless set a quarter of the processors, at "
         "least 2; with a GPU, all but two of them; with S3, which they wait for, twice as many",
     )
-    pool_without_vocabulary: bool = Field(
-        True,
-        description="describe the photos of a map whose extractor is shipped without a vocabulary "
-        "by GeM pooling until the map has one; false: they wait for it",
-    )
     local_features: Literal["xfeat", "aliked-n16"] = Field(
         "xfeat",
         description="local features of new generations, by which photos are matched: xfeat (at "

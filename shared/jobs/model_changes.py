@@ -38,12 +38,7 @@ from shared.catalog.maps import Matching, increment_map_version, lock_map
 from shared.catalog.photos import PhotoRole, count_live_photos
 from shared.errors import Conflict
 from shared.ids import new_id
-from shared.jobs.transitions import (
-    cancel_job,
-    cancel_jobs,
-    make_waiting_jobs_claimable,
-    requeue_job,
-)
+from shared.jobs.transitions import cancel_job, cancel_jobs, requeue_job
 
 
 def start_model_change(
@@ -102,8 +97,8 @@ def get_unfinished_model_change(session: Session, map_id: UUID) -> Job | None:
 def create_generation(session: Session, job: Job, **columns: Any) -> Generation:
     """Create the generation of the model change `job`, which then waits for its descriptors.
 
-    In a map without an active generation, the new one is active at once, and photos that waited for
-    a vocabulary are described into it. Otherwise it is built while the active one serves queries.
+    In a map without an active generation, the new one is active at once. Otherwise it is built
+    while the active one serves queries.
     """
     map_ = lock_map(session, job.map_id)
     active = active_generation(session, job.map_id)
@@ -123,19 +118,11 @@ def create_generation(session: Session, job: Job, **columns: Any) -> Generation:
     session.flush()
     if first:
         map_.extractor = generation.extractor
-        wake_vocabulary_waiters(session, job.map_id)
         increment_map_version(session, job.map_id)
     job.generation_id = generation.id
     job.stage = "describe"
     requeue_job(job, waiting_for=WaitingFor.DESCRIPTORS)
     return generation
-
-
-def wake_vocabulary_waiters(session: Session, map_id: UUID) -> None:
-    """Make the map's jobs that wait for a vocabulary claimable."""
-    make_waiting_jobs_claimable(
-        session, (Job.map_id == map_id) & (Job.waiting_for == WaitingFor.VOCABULARY)
-    )
 
 
 def cancel_model_change(session: Session, job: Job) -> None:

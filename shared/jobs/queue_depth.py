@@ -74,7 +74,7 @@ class PolledValue(Generic[T]):
 
 @dataclass(frozen=True, slots=True)
 class QueueDepth:
-    """Jobs that a worker could claim and none has; jobs that wait for a vocabulary don't count."""
+    """Jobs that a worker could claim and none has."""
 
     jobs_by_map: Mapping[str, int]
     """Map name -> number of its jobs, without queries."""

@@ -116,7 +116,7 @@ def requeue_job(
     A checkpointed job stays `running` between its slices; any other job is `queued` again.
 
     Args:
-        waiting_for: What it waits for; it can't be claimed until `make_waiting_jobs_claimable`.
+        waiting_for: What it waits for; it can't be claimed until that is null again.
         problem: Why it has to be retried, an RFC 9457 problem.
     """
     job.state = JobState.RUNNING if job.kind in CHECKPOINTED_JOBS else JobState.QUEUED
@@ -124,16 +124,6 @@ def requeue_job(
     job.run_after = db_now_plus(after_seconds) if after_seconds else None
     job.error = problem
     _drop_lease(job)
-
-
-def make_waiting_jobs_claimable(session: Session, condition: Condition) -> None:
-    """Make the waiting jobs that match the condition claimable: they need not wait any more."""
-    session.execute(
-        update(Job)
-        .where(Job.waiting_for.is_not(None), condition)
-        .values(waiting_for=None)
-        .execution_options(synchronize_session=False)
-    )
 
 
 def cancel_job(job: Job) -> None:

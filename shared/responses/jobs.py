@@ -28,8 +28,8 @@ class JobFields(ResponseModel):
         "`store`, `describe`"
     )
     waiting_for: str | None = Field(
-        description="what must become available before the job can continue: `vocabulary`, "
-        "`descriptors`, `search`, or for batches `disk_space`"
+        description="what must become available before the job can continue: `descriptors`, "
+        "`search`, or for batches `disk_space`"
     )
     awaited: list[str] | None = Field(
         description="search workers that the job has been waiting for longer than a minute"

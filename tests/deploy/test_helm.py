@@ -495,7 +495,7 @@ def test_extractors_are_scaled_by_the_jobs_that_wait_for_them_or_are_under_way(
         for kind in JobKind:
             for state in JobState:
                 session.add(Job(map_id=map_id, kind=kind, state=state, priority=1))
-            waits = {"state": JobState.QUEUED, "waiting_for": WaitingFor.VOCABULARY}
+            waits = {"state": JobState.QUEUED, "waiting_for": WaitingFor.DESCRIPTORS}
             session.add(Job(map_id=map_id, kind=kind, priority=1, **waits))
     assert counted() == 2 * len(EXTRACTOR_JOBS)  # queued and running
     with on_postgres.write() as session:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 from tests.support.server import ServerProcess
-from tests.support.waiting import wait_until
 
 # An extractor without a vocabulary of its own, in a map with too few photos to fit one by itself.
 SETTINGS = {"extractor": "test-tiny-vlad"}
@@ -81,68 +80,48 @@ def vocabulary(server: ServerProcess, vocabulary_id: str) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Before:
-    """What a map without a vocabulary answered."""
+    """A map without a vocabulary."""
 
     fit_of_nothing: httpx2.Response
     photos: list[str]
-    jobs: list[dict[str, Any]]
     stats: dict[str, Any]
-    by_stored: httpx2.Response
     by_new: httpx2.Response
     vocabularies: list[Any]
-    generations: list[Any]
 
 
 @pytest.fixture(scope="module")
 def before(server: ServerProcess) -> Before:
-    """PHOTOS photos wait for a vocabulary."""
+    """PHOTOS photos are described before the map has a vocabulary."""
     fit_of_nothing = server.client.post(VOCABULARIES, json={})
     uploads = [server.upload(photo_bytes(n), f"{n}.jpg").json() for n in range(PHOTOS)]
-    by_new = server.ask(photo_bytes(0))
-
-    def waiting() -> list[dict[str, Any]]:
-        jobs = [got(server.client.get(upload["status_url"])) for upload in uploads]
-        return jobs if all(job["waiting_for"] for job in jobs) else []
-
-    jobs = wait_until(waiting, pause=0.1)
+    for upload in uploads:
+        assert server.finished(upload["job_id"])["state"] == "succeeded"
     return Before(
         fit_of_nothing=fit_of_nothing,
         photos=[upload["file_id"] for upload in uploads],
-        jobs=jobs,
         stats=got(server.client.get("/api/v1/database/stats")),
-        by_stored=server.similar(uploads[0]["file_id"]),
-        by_new=by_new,
+        by_new=server.ask(photo_bytes(0)),
         vocabularies=got(server.client.get(VOCABULARIES)),
-        generations=got(server.client.get(GENERATIONS)),
     )
 
 
 @pytest.fixture(scope="module")
 def fitted(server: ServerProcess, before: Before) -> dict[str, Any]:
-    """The result of the first fit, which every photo was waiting for."""
+    """The result of the first fit."""
     return done(server, server.client.post(VOCABULARIES, json={}))
 
 
-def test_photos_wait_until_their_map_has_a_vocabulary(before: Before) -> None:
+def test_a_map_answers_before_it_has_a_vocabulary(before: Before) -> None:
     problem(before.fit_of_nothing, 409, "no_photos")
-    assert {(job["state"], job["waiting_for"]) for job in before.jobs} == {("queued", "vocabulary")}
-    assert before.stats["total_images"] == PHOTOS
-    assert before.stats["searchable_images"] == 0
-    assert before.stats["vocabulary"] is None
-    assert before.vocabularies == before.generations == []
-    waiting = problem(before.by_stored, 409, "not_searchable")
-    assert waiting["job_id"] == before.jobs[0]["job_id"]
-    assert "vocabulary" in waiting["detail"]
-    assert "POST /api/v1/vocabularies" in problem(before.by_new, 409, "no_vocabulary")["detail"]
+    assert before.stats["searchable_images"] == before.stats["total_images"] == PHOTOS
+    assert before.stats["vocabulary"] == "pending"
+    assert before.vocabularies == []
+    assert got(before.by_new)["similar_images"][0]["image_id"] == before.photos[0]
 
 
-def test_a_fit_makes_every_waiting_photo_searchable(
-    server: ServerProcess, before: Before, fitted: dict[str, Any]
-) -> None:
+def test_a_fit_describes_every_photo_again(server: ServerProcess, fitted: dict[str, Any]) -> None:
     assert fitted["photos"] == PHOTOS
     assert fitted["failed"] == 0
-    for job in before.jobs:
-        assert server.finished(job["job_id"])["state"] == "succeeded"
     learnt = vocabulary(server, fitted["vocabulary_id"])
     assert learnt["origin"] == "fitted"
     assert learnt["clusters"] == fitted["clusters"] > 1

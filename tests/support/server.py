@@ -34,7 +34,6 @@ def environment(home: Path, **settings: Any) -> dict[str, str]:
         "EXTRACTOR": "test-tiny-avg",
         "ALLOW_TEST_EXTRACTORS": "true",
         "DECODE_PROCESSES": "1",
-        "POOL_WITHOUT_VOCABULARY": "false",
         **{name.upper(): str(value) for name, value in settings.items()},
     }
 

@@ -100,10 +100,8 @@ def upload_photos(
         if outcome.job_id is not None and outcome.status not in FINISHED:
             pending.append((photo, outcome.job_id))
     describing = progress.add_task("describing", total=len(pending))
-    pending = _wait_for_jobs(client, pending, failed, progress, describing)
-
-    fit = wait_for_automatic_fit(client, progress)
     _wait_for_jobs(client, pending, failed, progress, describing)
+    fit = wait_for_automatic_fit(client, progress)
     stats = client.stats()
     return {
         "photos": len(photos),
@@ -197,28 +195,23 @@ def _patch_fields(fields: dict[str, str]) -> Json:
 
 def _wait_for_jobs(
     client: Client, pending: PendingJobs, failed: list[Json], progress: Progress, bar: TaskID
-) -> PendingJobs:
-    """Wait until jobs end; returns those that can't end before the map has a vocabulary."""
-    waiting: PendingJobs = []
+) -> None:
+    """Wait until jobs end, and note those that fail."""
     for photo, job_id in pending:
         try:
             job = wait_until_described(client, job_id)
         except NotFound:  # the photo was deleted meanwhile
             progress.advance(bar)
             continue
-        if not job.finished:
-            waiting.append((photo, job_id))
-            continue
         progress.advance(bar)
         if job.state != "succeeded":
             failed.append(_photo_failure(photo, job.failure))
-    return waiting
 
 
 def wait_until_described(client: Client, job_id: str | UUID) -> Job:
-    """Wait until the photo's job ends, or waits for a vocabulary; return it."""
-    job = client.job(job_id)  # at once: thousands of jobs may wait for a vocabulary
-    while not job.finished and not job.waiting_for:
+    """Wait until the photo's job ends; return it."""
+    job = client.job(job_id, POLL_SECONDS)
+    while not job.finished:
         if job.error is not None:  # it is retried until an operator has removed the cause
             _note_once(f"The photos wait: {job.error['code']}: {job.failure}")
         job = client.job(job_id, POLL_SECONDS)
@@ -257,8 +250,6 @@ def wait_for_batch(client: Client, started: BatchStarted, progress: Progress) ->
     job = _wait_until_finished(client, started, progress, describing)
     fit = wait_for_automatic_fit(client, progress)
     stats = client.stats()
-    if not job.finished and stats.vocabulary is not None:
-        job = _wait_until_finished(client, started, progress, describing)
     job.raise_for_failure()
     failed_items = list(client.batch_items(started, "failed", "cancelled"))
     counts = job.result or {}
@@ -281,13 +272,11 @@ def wait_for_batch(client: Client, started: BatchStarted, progress: Progress) ->
 def _wait_until_finished(
     client: Client, started: BatchStarted, progress: Progress, bar: TaskID
 ) -> Job:
-    """Wait until a batch ends or waits for a vocabulary."""
+    """Wait until a batch ends."""
     reported = False
     for job in client.watch(started, poll_seconds=POLL_SECONDS):
         counts = job.progress
         progress.update(bar, completed=counts.done + counts.failed, total=counts.total or None)
-        if job.waiting_for == "vocabulary":
-            break
         if job.waiting_for and not reported:
             reason = job.waiting_for.replace("_", " ")
             print_note(

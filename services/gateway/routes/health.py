@@ -20,7 +20,6 @@ from shared.catalog.maps import (
     Map,
     count_failed_photos,
     list_extractors_in_use,
-    list_maps_without_vocabulary,
 )
 from shared.catalog.processes import PROCESS_TIMEOUT_SECONDS, list_processes
 from shared.config.settings import Settings
@@ -85,9 +84,6 @@ class ExtractorsStatus(ComponentStatus):
     """
 
     processes: list[ExtractorProcess] = Field(description="extractors with a recent heartbeat")
-    waiting_for_vocabulary: list[str] = Field(
-        description="maps whose photos wait until a vocabulary is fitted or imported"
-    )
     failed_photos: dict[str, int] = Field(
         description="map -> number of stored photos that can't be searched for, because their "
         "description failed; GET /search?failed=true lists them"
@@ -308,7 +304,6 @@ def _check_extractors(gateway: GatewayContext, depth: QueueDepth) -> ExtractorsS
         extractors = [p for p in list_processes(session) if p.role == "extractor"]
         used = {*list_extractors_in_use(session), gateway.settings.local_features}
         overdue = is_job_overdue(session, PROCESS_TIMEOUT_SECONDS)
-        waiting = list_maps_without_vocabulary(session)
         failed = count_failed_photos(session)
     details: dict[str, str] = {}
     for process in extractors:
@@ -349,7 +344,6 @@ def _check_extractors(gateway: GatewayContext, depth: QueueDepth) -> ExtractorsS
         status=status,
         detail="; ".join([f"{len(live)} running"] * (status == "healthy") + problems),
         processes=live,
-        waiting_for_vocabulary=waiting,
         failed_photos=failed,
     )
 

@@ -215,8 +215,6 @@ def _outcome_message(stored: StoreResult, job: Job | None) -> str:
     reason = (job.error or {}).get("detail", "")
     if job.state not in UNFINISHED_STATES:
         return f"{beginning}, but its job is {job.state}. {reason}".strip()
-    if job.waiting_for:
-        return f"{beginning}. Its job is waiting for {job.waiting_for}."
     if reason:
         return f"{beginning}. Describing it failed and will be tried again: {reason}"
     return f"{beginning}. It is being described in the background."

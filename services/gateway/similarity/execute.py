@@ -486,8 +486,6 @@ def _not_searchable_error(session: Session, photo: Photo, map_name: str) -> Conf
     if job.state == JobState.FAILED:
         reason = (job.error or {}).get("detail", "no reason is stored")
         detail = f"The photo could not be described: {reason}"
-    elif job.waiting_for:
-        detail = f"The photo is not searchable yet: its job is waiting for {job.waiting_for}."
     else:
         detail = f"The photo is not searchable yet: its job is {job.state}. Poll {status_url}."
     return Conflict("not_searchable", detail, **extra)

@@ -21,7 +21,7 @@ from typing import Any
 from uuid import UUID
 
 from prometheus_client import CollectorRegistry
-from sqlalchemy import exists, select
+from sqlalchemy import exists, select, update
 from sqlalchemy.orm import Session
 
 from services.steward.metrics import StewardMetrics
@@ -31,8 +31,6 @@ from shared.catalog.batch_items import (
     BatchSource,
     add_batch_items,
     count_queued_photos,
-    is_waiting_for_vocabulary,
-    lock_batch,
     next_queued_items,
     summarise_batch,
     sync_item_states,
@@ -63,14 +61,9 @@ from shared.ingest.validation import (
     validate_photo,
 )
 from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
-from shared.jobs.leases import get_lease_token, lock_leased_job
+from shared.jobs.leases import lock_leased_job
 from shared.jobs.runner import MAX_ATTEMPTS, JobInterrupted, JobRunner
-from shared.jobs.transitions import (
-    cancel_batch_items,
-    make_waiting_jobs_claimable,
-    requeue_job,
-    succeed_job,
-)
+from shared.jobs.transitions import cancel_batch_items, requeue_job, succeed_job
 from shared.storage import ObjectStore
 from shared.storage.keys import IMPORTS, new_original_key
 from shared.utm_filenames import upload_fields_of_file_name
@@ -228,7 +221,7 @@ def resume_batches(catalog: Catalog, settings: Settings) -> None:
     except StorageFull:
         return
     with catalog.write() as session:
-        make_waiting_jobs_claimable(session, waits)
+        session.execute(update(Job).where(waits).values(waiting_for=None))
 
 
 @periodic_task(1.0)
@@ -334,7 +327,7 @@ class BatchWorker:
     def _finish_slice(self, job: Job, waiting_for: WaitingFor | None = None) -> None:
         """Update the progress; complete the batch, or requeue it for its next slice."""
         with self._catalog.write() as session:
-            leased = lock_batch(session, job, get_lease_token(job))
+            leased = lock_leased_job(session, job)
             if leased is None:
                 raise JobInterrupted
             leased.attempts = 0
@@ -345,12 +338,7 @@ class BatchWorker:
                 return
             if counts[JobState.RUNNING]:
                 leased.stage = "describe"
-                waits = is_waiting_for_vocabulary(session, leased)
-                requeue_job(
-                    leased,
-                    after_seconds=PROGRESS_POLL_SECONDS,
-                    waiting_for=WaitingFor.VOCABULARY if waits else None,
-                )
+                requeue_job(leased, after_seconds=PROGRESS_POLL_SECONDS)
                 return
             succeed_job(leased, summarise_batch(session, leased, counts))
             update_batch_progress(leased, counts)

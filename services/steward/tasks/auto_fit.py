@@ -9,13 +9,13 @@ from __future__ import annotations
 import logging
 from uuid import UUID
 
-from sqlalchemy import exists, or_, select
+from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
 
 from services.steward.periodic_tasks import periodic_task
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
-from shared.catalog.jobs import UNFINISHED_STATES, WaitingFor
+from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import Map, has_database_photos, list_maps, lock_map
 from shared.catalog.photos import Photo
 from shared.catalog.vocabularies import next_fit_photos
@@ -71,12 +71,11 @@ def is_fit_due(session: Session, map_: Map) -> bool:
 
 
 def _has_queued_photos(session: Session, map_id: UUID) -> bool:
-    """Return whether photos or batches are queued that do not wait for the vocabulary itself."""
+    """Return whether photos or batches are queued."""
     queued = exists().where(
         Job.map_id == map_id,
         Job.kind.in_((JobKind.INDEX, JobKind.BATCH)),
         Job.state.in_(UNFINISHED_STATES),
-        or_(Job.waiting_for.is_(None), Job.waiting_for != WaitingFor.VOCABULARY),
     )
     return bool(session.scalar(select(queued)))
 

@@ -63,9 +63,7 @@ async function* events(id, signal, query) {
 
 /** What a job is at, in words. */
 export function stateInWords(job) {
-  if (job.state === "queued" && job.waiting_for === "vocabulary") return "waits for a vocabulary";
   if (job.waiting_for === "disk_space") return "waits for disk space";
-  if (job.state === "queued" && job.waiting_for) return `waits for ${job.waiting_for}`;
   const stage = { sample: "looking at photos", cluster: "finding centres", gather: "reading descriptors", reduce: "computing the projection", describe: "describing", load: "loading into search", list: "listing", store: "storing", pairs: "choosing pairs", match: "matching photos", map: "computing the model", align: "aligning it", calibrate: "testing its poses" }[job.stage];
   if (job.state === "running") return stage ?? "being described";
   return { queued: "waiting", succeeded: "done", failed: "failed", cancelled: "cancelled" }[job.state];

@@ -18,9 +18,6 @@ from shared.catalog.jobs import SINGLE_CLAIM_JOBS, Priority, WaitingFor, get_job
 from shared.errors import NotFound
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.claim import claim_jobs, fair_batch_size
-from shared.jobs.model_changes import (
-    wake_vocabulary_waiters,
-)
 from tests.contract.jobs.jobs import ids, queue, token_of
 from tests.support.catalog_rows import (
     add_generation,
@@ -110,18 +107,10 @@ def test_jobs_of_single_claim_kinds_are_claimed_one_at_a_time(
 
 
 def test_a_job_with_waiting_for_is_not_claimed(catalog: Catalog, map_id: UUID) -> None:
-    waiting = queue(catalog, map_id, 2, waiting_for=WaitingFor.VOCABULARY)
-    with catalog.write() as session:
-        other = add_map(session, "other").id
-    queue(catalog, other, waiting_for=WaitingFor.VOCABULARY)
     queue(catalog, map_id, kind=JobKind.FIT, waiting_for=WaitingFor.DESCRIPTORS)
     ready = queue(catalog, map_id)
     assert ids(take(catalog)) == ready
     assert take(catalog) == []
-    with catalog.write() as session:
-        wake_vocabulary_waiters(session, map_id)
-    assert ids(take(catalog)) == waiting
-    assert take(catalog) == [], "waiters of another map and for something else stay"
 
 
 def test_a_job_is_not_claimed_before_its_run_after(catalog: Catalog, map_id: UUID) -> None:

@@ -47,7 +47,7 @@ def test_a_finished_job_can_not_be_cancelled(catalog: Catalog, map_id: UUID) -> 
 def test_a_running_job_is_cancelled_at_once_and_the_others_of_its_batch_go_on(
     catalog: Catalog, map_id: UUID
 ) -> None:
-    queued = queue(catalog, map_id, waiting_for=WaitingFor.VOCABULARY)
+    queued = queue(catalog, map_id, waiting_for=WaitingFor.SEARCH)
     first, running, last = queue(catalog, map_id, 3)
     jobs = take(catalog)
     cancelled = [*queued, running]

@@ -419,7 +419,7 @@ def allowing(service: Service, make_worker: Callable[..., ExtractorWorker]) -> S
         service.catalog,
         service.store,
         service.settings,
-        lambda: make_worker(code_allowed=code, pool_without_vocabulary=True),
+        lambda: make_worker(code_allowed=code),
     )
 
 

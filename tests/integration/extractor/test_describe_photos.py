@@ -14,13 +14,12 @@ import pytest
 from numpy.typing import NDArray
 from sqlalchemy import func, select
 
-from services.extractor import describe, fits
-from services.extractor.generation_resolver import resolve_generation
+from services.extractor import fits
 from services.extractor.worker import ExtractorWorker
 from services.steward.tasks import auto_fit
 from services.steward.tasks.auto_fit import fit_due_vocabularies
 from shared.catalog.chunks import Chunk, list_live_chunks
-from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.generations import Generation
 from shared.catalog.jobs import WaitingFor
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
@@ -33,7 +32,7 @@ from shared.storage.chunks import decode_rows, manifest_key
 from shared.storage.keys import query_vector_key, thumbnail_key
 from tests.integration.extractor.conftest import Hook
 from tests.integration.harness import Harness, expected_row, once, same
-from tests.support.catalog_rows import failure_code, problem_of, set_columns
+from tests.support.catalog_rows import problem_of, set_columns
 from tests.support.photos import encoded, photo_bytes, photo_image
 
 
@@ -242,17 +241,9 @@ def test_queries_and_photos_are_described_while_a_vocabulary_is_fitted(
 
 
 @pytest.mark.usefixtures("fit_at_four_photos")
-def test_photos_wait_for_a_vocabulary_which_is_fitted_once_there_are_enough(vlads: Harness) -> None:
+def test_a_vocabulary_is_fitted_once_there_are_enough_photos(vlads: Harness) -> None:
     photo_ids = vlads.upload(1, 2, 3)
-    query = vlads.ask(photo_bytes(9))
     vlads.drain()
-    for photo_id in photo_ids:
-        job = vlads.job_of(photo_id)
-        assert (job.state, job.waiting_for) == (JobState.QUEUED, WaitingFor.VOCABULARY)
-        assert job.attempts == 0
-    refused = vlads.job(query)
-    assert failure_code(refused) == "no_vocabulary"
-
     assert vlads.fit_if_due() == []
     assert not vlads.wakeups.wait(0)
     photo_ids += vlads.upload(4)
@@ -334,32 +325,3 @@ def test_no_vocabulary_is_fitted_where_it_is_switched_off_or_none_is_used(
     with vlads.catalog.write() as session:
         session.get_one(Map, vlads.map_id).auto_fit = True
     assert len(vlads.fit_if_due()) == 1
-
-
-def test_a_photo_that_finds_no_vocabulary_while_one_is_made_is_not_left_waiting(
-    vlads: Harness, make_worker: Callable[[], ExtractorWorker], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    vlads.upload(1, 2)
-    slow, quick = make_worker(), make_worker()
-    late: list[UUID] = []
-
-    def find_or_fit(*arguments: Any) -> Any:
-        found = resolve_generation(*arguments)
-        if late and found is None and vlads.job_of(late[0]).worker == "worker-0":
-            fit()
-        return found
-
-    fit = once(lambda: _fit_with(vlads, quick))
-    _drain(slow)
-    late += vlads.upload(3)
-    monkeypatch.setattr(describe, "resolve_generation", find_or_fit)
-    _drain(slow)  # sees no vocabulary; before it says so, the other worker has fitted one
-    assert vlads.job_of(late[0]).state == JobState.SUCCEEDED
-    assert set(vlads.rows()) >= set(late)
-
-
-def _fit_with(harness: Harness, worker: ExtractorWorker) -> None:
-    harness.start(JobKind.FIT, clusters=8, sample=100, seed=0)
-    assert worker.fits.run_next(threading.Event())
-    _drain(worker)
-    assert harness.active().state == GenerationState.ACTIVE

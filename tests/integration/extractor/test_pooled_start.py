@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
 from pathlib import Path
 from uuid import UUID
 
@@ -11,9 +9,8 @@ import pytest
 from sqlalchemy import select
 
 from services.extractor.generation_resolver import reindex_outdated_generations
-from services.extractor.worker import ExtractorWorker
 from shared.catalog.database.session import Catalog
-from shared.catalog.jobs import UNFINISHED_STATES, WaitingFor
+from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import Map
 from shared.catalog.vocabularies import vocabulary_standing
 from shared.config.settings import Settings
@@ -21,7 +18,6 @@ from shared.jobs import Job, JobKind, JobState
 from tests.integration.extractor.model_changes import import_file, npy, some_centres
 from tests.integration.harness import Harness, expected_row, same
 from tests.integration.in_process_api import Service
-from tests.support.catalog_rows import set_columns
 from tests.support.photos import photo_bytes
 from tests.support.vit import random_weights, save
 
@@ -30,11 +26,8 @@ POOLED = "test-tiny-vlad:aggregator=gem"
 
 
 @pytest.fixture
-def settings(weights: Path, monkeypatch: pytest.MonkeyPatch) -> Settings:
-    monkeypatch.delenv("POOL_WITHOUT_VOCABULARY")
-    found = Settings()
-    assert found.pool_without_vocabulary, "it is the default"
-    return found
+def settings(weights: Path) -> Settings:
+    return Settings()
 
 
 @pytest.fixture
@@ -121,18 +114,6 @@ def test_switching_to_the_pooling_extractor_by_name_is_no_waiting_for_a_vocabula
     assert pooled.finish(job).state == JobState.SUCCEEDED
     assert extractors(pooled) == (POOLED, POOLED, "none")
     assert pooled.fit_if_due() == []
-
-
-def test_photos_that_waited_for_a_vocabulary_are_described_once_a_worker_starts(
-    vlads: Harness, make_worker: Callable[[], ExtractorWorker]
-) -> None:
-    (photo_id,) = vlads.upload(1)
-    set_columns(vlads.catalog, vlads.job_of(photo_id).id, waiting_for=WaitingFor.VOCABULARY)
-    vlads.drain()
-    assert vlads.job_of(photo_id).state == JobState.QUEUED
-    make_worker().warm_up(threading.Event())
-    vlads.drain()
-    assert vlads.searchable() == 1
 
 
 def test_a_dinov2_map_answers_from_its_first_photo_and_says_that_its_vocabulary_is_pending(

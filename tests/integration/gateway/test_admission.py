@@ -162,7 +162,7 @@ def test_the_queue_is_counted_up_to_a_limit_without_jobs_that_no_worker_could_cl
         add_job(session, other, JobKind.EVALUATE)
         add_job(session, other, JobKind.DESCRIBE)
         add_job(session, one, JobKind.DESCRIBE)
-        add_job(session, one, waiting_for="vocabulary")
+        add_job(session, one, JobKind.FIT, waiting_for="descriptors")
         add_job(session, one, JobKind.REINDEX)
         for state in (JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED):
             add_job(session, one, state=state)

@@ -13,7 +13,6 @@ from services.steward.batches import worker as worker_module
 from services.steward.batches.worker import cancel_items_of_ended_batches
 from shared.catalog.database.session import Catalog
 from shared.jobs import Job, JobKind, JobState
-from tests.integration.in_process_api import Service
 from tests.integration.steward.batches import Batches, codes, counts, files, lines
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
@@ -238,22 +237,3 @@ def test_a_photo_that_is_deleted_meanwhile_ends_its_item(batches: Batches) -> No
     job = batches.finish(job_id)
     assert (job["state"], batches.states(job_id)) == ("succeeded", ["cancelled", "succeeded"])
     assert counts(job) == (1, 2, 0)
-
-
-def test_a_batch_waits_with_its_photos_for_a_vocabulary(batches: Batches, service: Service) -> None:
-    service.json("POST", "/maps", 201, json={"name": "vlad", "extractor": "test-tiny-vlad"})
-    sent = [("file", file) for file in files(1, 2)]
-    started = service.json("POST", "/upload/batch", 202, params={"map": "vlad"}, files=sent)
-    for _ in range(3):
-        batches.work()
-        service.drain()
-    path = f"/jobs/{started['job_id']}"
-    job = service.json("GET", path, params={"map": "vlad"})
-    assert (job["state"], job["waiting_for"]) == ("running", "vocabulary")
-    assert not batches.work()
-    service.json("POST", "/vocabularies", 202, params={"map": "vlad"}, json={"clusters": 2})
-    for _ in range(6):
-        service.drain()
-        batches.work()
-    job = service.json("GET", path, params={"map": "vlad"})
-    assert (job["state"], counts(job)) == ("succeeded", (2, 2, 0))

@@ -141,8 +141,7 @@ def test_the_loop_runs_each_task(
     chunk_map.delete(gone)
     with chunk_map.catalog.write() as session:
         other = add_map(session, "other", "test-tiny-vlad").id
-        waiting = add_photo(session, other).id
-        add_job(session, other, photo_id=waiting, waiting_for="vocabulary")
+        add_photo(session, other)
         lost = add_job(session, chunk_map.map_id).id
     take(chunk_map.catalog)
     chunk_map.change(Job, lost, lease_until=db_now_plus(-1))
@@ -196,7 +195,7 @@ def test_a_lost_wakeup_is_sent_again_while_there_are_jobs(chunk_map: ChunkMap) -
     wakeups = InProcessWakeups()
     resend_wakeups(chunk_map.catalog, wakeups)
     assert not wakeups.wait(0)
-    add_one_job(chunk_map, JobKind.INDEX, waiting_for="vocabulary")
+    add_one_job(chunk_map, JobKind.FIT, waiting_for="descriptors")
     add_one_job(chunk_map, JobKind.INDEX, run_after=db_now_plus(60))
     resend_wakeups(chunk_map.catalog, wakeups)
     assert not wakeups.wait(0)  # no worker could do anything

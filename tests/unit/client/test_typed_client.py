@@ -83,7 +83,7 @@ def test_watching_a_job_shows_each_state_and_does_not_raise_its_failure(
     own = SimpleNamespace(sleep=waits.append, monotonic=time.monotonic)
     monkeypatch.setattr("placewise.client.time", own)
     server.will_answer(200, {**JOB, "state": "running"})
-    server.will_answer(200, {**JOB, "state": "queued", "waiting_for": "vocabulary"})
+    server.will_answer(200, {**JOB, "state": "queued", "waiting_for": "disk_space"})
     server.will_answer(200, {**JOB, "state": "cancelled"})
     with placewise.connect(server.url) as places:
         seen = list(places.watch(answers.Started(**STARTED), poll_seconds=2))
