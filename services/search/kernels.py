@@ -24,8 +24,6 @@ from shared.codes.jit import REORDERED_FASTMATH, numba_jit
 
 EXCLUDED_DISTANCE = 65_535  # more than any distance
 PLANES = 4  # `weighted_bit_sums` is written for exactly 4
-LOW_BIT_OF_EACH_BYTE = np.uint64(0x0101010101010101)
-BIT_GATHER_FACTOR = np.uint64(0x0102040810204080)
 
 Words = NDArray[np.uint64]
 Addresses = NDArray[np.uint64]
@@ -238,52 +236,3 @@ def squared_norm(row: NDArray[np.float32]) -> float:
     for i in range(row.shape[0]):
         total += np.float64(row[i]) * np.float64(row[i])
     return total
-
-
-@numba_jit(REORDERED_FASTMATH)
-def quantize_to_bit_planes(
-    numbers: NDArray[np.float32], signs: Words, planes: Words
-) -> tuple[float, float, float, float, float]:
-    """Quantize (64 n,) float32 numbers to 2^PLANES steps, as bit planes, and pack their signs.
-
-    Args:
-        numbers: (64 n,) float32.
-        signs: (n,) uint64; bit j of word i is 1 where number 64 i + j is not negative.
-        planes: (PLANES, n) uint64; the bits, in the same places, of the integer w, 0 to 2^PLANES -
-            1, for which low + step w is nearest to the number.
-
-    Returns:
-        low, step, and of the quantized numbers: their sum, their product with `numbers`, and their
-        sum of squares.
-    """
-    low, high = numbers[0], numbers[0]
-    for i in range(numbers.shape[0]):
-        low, high = min(low, numbers[i]), max(high, numbers[i])
-    step = (high - low) / np.float32(2**PLANES - 1)
-    inverse = np.float32(1.0) / step
-    total = product = square = 0.0
-    quantized = np.empty(64, np.uint8)
-    packed = quantized.view(np.uint64)
-    for i in range(planes.shape[1]):
-        part = numbers[64 * i : 64 * i + 64]
-        sums = sums_of_products = sums_of_squares = np.float32(0.0)
-        for j in range(64):
-            nearest = np.int32((part[j] - low) * inverse + np.float32(0.5))
-            rounded = np.float32(nearest) * step + low
-            quantized[j] = np.uint8(nearest) | (np.uint8(part[j] >= 0) << np.uint8(PLANES))
-            sums += rounded
-            sums_of_products += rounded * part[j]
-            sums_of_squares += rounded * rounded
-        total += sums
-        product += sums_of_products
-        square += sums_of_squares
-        for plane in range(PLANES + 1):
-            plane_bits = np.uint64(0)
-            for j in range(8):  # the multiplication gathers a bit of each byte in the top byte
-                bits = (packed[j] >> np.uint64(plane)) & LOW_BIT_OF_EACH_BYTE
-                plane_bits |= ((bits * BIT_GATHER_FACTOR) >> np.uint64(56)) << np.uint64(8 * j)
-            if plane < PLANES:
-                planes[plane, i] = plane_bits
-            else:
-                signs[i] = plane_bits
-    return low, step, total, product, square

@@ -40,12 +40,18 @@ from services.search.kernels import (
     PLANES,
     add_hamming_distances,
     hamming_distances,
-    quantize_to_bit_planes,
     squared_norm,
     weighted_bit_sums,
 )
 from shared.codes.rotation import Rotation, get_rotation
-from shared.codes.sign_codes import WORD_BITS, Words, encode_signs, level_ends
+from shared.codes.sign_codes import (
+    WORD_BITS,
+    Words,
+    encode_signs,
+    level_ends,
+    pack_bits,
+    pack_signs,
+)
 
 BOUND_DEVIATIONS = 6.0
 SEED_ROWS = 64  # rows, or k, estimated from their whole codes early, to raise the floor
@@ -106,19 +112,23 @@ class SignCodedQuery:
     @classmethod
     def of(cls, row: NDArray[np.float32], row_rotation: Rotation) -> SignCodedQuery:
         """Rotate and quantize a (dimension,) row of any length but 0."""
-        rotated = row_rotation.rotate(row[np.newaxis])[0]
-        bits = np.empty(row_rotation.padded // WORD_BITS, np.uint64)
-        planes = np.empty((PLANES, len(bits)), np.uint64)
-        low, step, total, product, squared_sum = quantize_to_bit_planes(rotated, bits, planes)
+        rotated = row_rotation.rotate(row[np.newaxis])
+        low = rotated.min()
+        step = (rotated.max() - low) / np.float32(2**PLANES - 1)
+        integers = ((rotated - low) * (1 / step) + np.float32(0.5)).astype(np.uint8)
+        quantized = integers * step + low
+        product = float(np.einsum("ij,ij", quantized, rotated))
+        squared_sum = float(np.einsum("ij,ij", quantized, quantized))
         norm = math.sqrt(squared_norm(row))
+        plane_bits = (1 << np.arange(PLANES, dtype=np.uint8))[:, np.newaxis]
         return cls(
             row=row,
             norm=norm,
-            bits=bits,
-            planes=planes,
-            low=low,
-            step=step,
-            total=total,
+            bits=pack_signs(rotated)[0],
+            planes=pack_bits(integers & plane_bits),
+            low=float(low),
+            step=float(step),
+            total=float(quantized.sum()),
             query_product=product / norm,
             quantization_error=max(0.0, squared_sum * norm**2 / product**2 - 1.0),
         )

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,5 +83,10 @@ def encode_signs(rows: StoredFloats) -> SignCodes:
 
 def pack_signs(rotated: Floats) -> Words:
     """Pack the signs of (n, m) float32 numbers, m a multiple of 64, into (n, m / 64) uint64."""
-    bits = np.packbits(rotated >= 0, axis=-1, bitorder="little")
-    return bits.view("<u8").astype(np.uint64, copy=False)
+    return pack_bits(rotated >= 0)
+
+
+def pack_bits(bits: NDArray[Any]) -> Words:
+    """Pack (n, m) bits, numbers that are 0 or not, m a multiple of 64, into (n, m / 64) uint64."""
+    packed = np.packbits(bits, axis=-1, bitorder="little")
+    return packed.view("<u8").astype(np.uint64, copy=False)
