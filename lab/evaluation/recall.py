@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 POSITIVE_WITHIN_M = 25.0
 
@@ -28,22 +29,9 @@ def positives_within(
     """
     if not len(database):
         return [np.empty(0, np.int64) for _ in queries]
-    # Only the database photos of a band along the longer side of the area are compared with a
-    # query. It is wider than the radius, so that rounding excludes nobody.
-    axis = int(np.argmax(np.ptp(database, axis=0)))
-    order = np.argsort(database[:, axis], kind="stable")
-    ordered = database[order]
-    margin_m = within_m + 1e-3
-    first = np.searchsorted(ordered[:, axis], queries[:, axis] - margin_m, "left")
-    last = np.searchsorted(ordered[:, axis], queries[:, axis] + margin_m, "right")
-    positives: list[Indices] = []
-    for query, start, stop in zip(queries, first, last, strict=True):
-        offset = ordered[start:stop] - query
-        # Compare squares, as the search trees of published ground truths do: a root would round
-        # once more.
-        is_positive = offset[:, 0] ** 2 + offset[:, 1] ** 2 <= within_m**2
-        positives.append(np.sort(order[start:stop][is_positive]))
-    return positives
+    # The tree compares squares, as those of published ground truths do: a root would round.
+    found = cKDTree(database).query_ball_point(queries, within_m, return_sorted=True)
+    return [np.array(rows, np.int64) for rows in found]
 
 
 def compute_hits(ranked: Indices, positives: Sequence[Indices]) -> Hits:

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import mannwhitneyu
 
 from lab.datasets.dataset import DatasetPhoto
 from lab.datasets.utm_coordinates import pairwise_distances_m
-from lab.evaluation.confidence_metrics import auroc, recall_at_precision
 from lab.evaluation.exact_knn import Indices, Scores
 from lab.evaluation.query_clusters import QueryClusters
 from lab.evaluation.ranking import DEFAULT_KS, Recalls, compute_recalls
@@ -67,6 +67,10 @@ class PrecisionRecall:
     area: float
     """average precision: the sum of (R_i - R_(i-1)) P_i"""
 
+    def recall_at(self, precision: float) -> float:
+        """Return the highest recall of a threshold with this precision; 0 if none has it."""
+        return float(self.recall[self.precision >= precision].max(initial=0.0))
+
 
 def precision_recall(
     scores: NDArray[np.floating], correct: NDArray[np.bool_], queries_with_positive: int
@@ -87,6 +91,17 @@ def precision_recall(
     return PrecisionRecall(
         ordered[cuts].astype(np.float64), precision, recall, float((steps * precision).sum())
     )
+
+
+def auroc(scores: NDArray[np.floating], correct: NDArray[np.bool_]) -> float | None:
+    """Compute the AUROC: P(a correct query scores higher than a wrong one); ties count half.
+
+    None unless there are both correct and wrong queries.
+    """
+    if correct.all() or not correct.any():
+        return None
+    won = mannwhitneyu(scores[correct], scores[~correct]).statistic
+    return float(won / correct.sum() / (~correct).sum())
 
 
 Distances = NDArray[np.float64]
@@ -220,9 +235,8 @@ def compute_metrics(
     curve = area = sure = None
     if scores is not None:
         curve = precision_recall(scores[:, 0], hits[:, 0], int(findable.sum()))
-        first, correct = scores[:, 0].astype(np.float64).tolist(), hits[:, 0].tolist()
-        area = auroc(first, correct)
-        sure = recall_at_precision(first, correct, int(findable.sum()), 0.99)
+        area = auroc(scores[:, 0], hits[:, 0])
+        sure = curve.recall_at(0.99) if curve else None
     return RetrievalMetrics(
         recalls=compute_recalls(ranked, positives, ks),
         hits=hits,

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.datasets.ground_truth import parse_rule
 from lab.evaluation.array_photo_graph import ArrayPhotoGraph
-from lab.evaluation.confidence_metrics import recall_at_precision
 from lab.evaluation.places import RANKS, SAMPLED_PHOTOS, measure_background
+from lab.evaluation.retrieval_metrics import precision_recall
 from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
 from shared.evaluation.places.fit import MapScores, fit_place_model
@@ -275,14 +275,15 @@ def sequence_figures(sequences: Sequence[Sequence[FrameResult]]) -> dict[str, An
             for name in ("single", "filter", "smoothed")
         },
         "recall_at_99_precision": {
-            name: recall_at_precision(
-                [getattr(frame, score) for frame in frames],
-                [getattr(frame, f"{name}_is_right") for frame in frames],
-                len(inside),
-            )
-            if inside
-            else None
+            name: curve.recall_at(0.99) if curve else None
             for name, score in (("single", "single_score"), ("filter", "probability"))
+            for curve in [
+                precision_recall(
+                    np.array([getattr(frame, score) for frame in frames]),
+                    np.array([getattr(frame, f"{name}_is_right") for frame in frames]),
+                    len(inside),
+                )
+            ]
         },
         "tracking": _share([frame.status == "tracking" for frame in inside]),
         "tracking_precision": _share([frame.filter_is_right for frame in tracked]),

@@ -70,15 +70,15 @@ def indexed(server: ServerProcess, tmp_path_factory: pytest.TempPathFactory) -> 
     cut_off.write_bytes(photo_bytes(99)[:-60])  # its header is whole
 
     command = CommandLine(folder.parent, server.home)
-    assert command("maps", "create", "waiting").code == 0
+    assert command("maps", "create", "pooled").code == 0
     index = ("index", folder, "--utm-zone", "32T")
-    without_fit = command(*index, "--map", "waiting", "--no-fit", "--json")
+    without_fit = command(*index, "--map", "pooled", "--no-fit", "--json")
     listed = command("maps", "list", "--json").json()
     assert {map_["name"]: map_["auto_fit"] for map_ in listed} == {
         "default": True,
-        "waiting": False,
+        "pooled": False,
     }
-    assert command("maps", "delete", "waiting", "--yes").code == 0
+    assert command("maps", "delete", "pooled", "--yes").code == 0
     with_fit = command(*index, "--json")
     broken.unlink()
     cut_off.unlink()
@@ -92,8 +92,8 @@ def test_index_uploads_a_folder_and_names_what_is_refused(indexed: Indexed) -> N
     assert [item["path"] for item in report["refused"]] == [str(indexed.folder / "broken.jpg")]
     assert "JPEG" in report["refused"][0]["reason"]
     assert report["fitted"] is None
-    assert report["vocabulary"] is None, "--no-fit: they wait for one"
-    assert report["searchable"] == 0
+    assert report["vocabulary"] == "pending"
+    assert report["searchable"] == PHOTOS
 
 
 def test_index_fits_a_vocabulary_from_fifty_photos_on(indexed: Indexed) -> None:

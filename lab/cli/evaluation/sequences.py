@@ -6,7 +6,6 @@ import statistics
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.progress import Progress
 from rich.table import Column
 
@@ -89,7 +88,7 @@ def _evaluate_set(
     describer = make_describer(evaluation_set, target, read_settings(), progress)
     on_progress = stage_bars(progress, f"{evaluation_set.name}: ")
     with describe_evaluation_set(describer.describe, evaluation_set, on_progress) as matrices:
-        database, queries = (_normalise(rows) for rows in matrices)
+        database, queries = map(np.array, matrices)
     map_ = prepare_map(evaluation_set, database, motion)
     sequences: list[list[FrameResult]] = []
     milliseconds: list[float] = []
@@ -110,12 +109,6 @@ def _evaluate_set(
         **sequence_figures(sequences),
         "sequences": by_sequence,
     }
-
-
-def _normalise(rows: NDArray[np.float32]) -> NDArray[np.float32]:
-    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-    normalised: NDArray[np.float32] = rows / np.maximum(lengths, 1e-12)
-    return normalised
 
 
 def _print_figures(name: str, figures: Json) -> None:

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as some
 from scipy.stats import binomtest
 
 from lab.datasets.dataset import DatasetPhoto
@@ -17,6 +19,7 @@ from lab.evaluation.query_clusters import cluster_queries, singleton_clusters
 from lab.evaluation.ranking import compute_recalls
 from lab.evaluation.recall import compute_hits, recall_at_k
 from lab.evaluation.retrieval_metrics import (
+    auroc,
     average_precisions,
     compute_metrics,
     distance_error,
@@ -78,6 +81,41 @@ def test_precision_and_recall_go_by_the_score_and_equal_scores_are_believed_toge
     assert curve.recall.tolist() == [1 / 4, 2 / 4, 2 / 4, 3 / 4]
     assert curve.area == pytest.approx(1 / 4 * 1 + 1 / 4 * 2 / 3 + 0 + 1 / 4 * 3 / 5)
     assert precision_recall(scores, right, queries_with_positive=0) is None
+
+
+judged_scores = some.lists(
+    some.tuples(some.sampled_from([0.0, 0.1, 0.25, 0.5, 0.9, 1.0]), some.booleans()),
+    min_size=1,
+    max_size=30,
+)
+
+
+@given(judged_scores)
+def test_the_auroc_is_that_of_all_pairs(judged: list[tuple[float, bool]]) -> None:
+    right = [score for score, ok in judged if ok]
+    wrong = [score for score, ok in judged if not ok]
+    scores, correct = map(np.array, zip(*judged, strict=True))
+    found = auroc(scores, correct)
+    if not right or not wrong:
+        assert found is None
+        return
+    won = sum((r > w) + 0.5 * (r == w) for r in right for w in wrong)
+    assert found == pytest.approx(won / (len(right) * len(wrong)))
+
+
+@given(judged_scores, some.sampled_from([0.0, 0.5, 0.7, 0.99]))
+def test_recall_at_a_precision_is_the_best_over_all_cuts(
+    judged: list[tuple[float, bool]], precision: float
+) -> None:
+    best = 0
+    for cut, _ in judged:
+        taken = [ok for score, ok in judged if score >= cut]
+        if sum(taken) / len(taken) >= precision:
+            best = max(best, sum(taken))
+    scores, correct = map(np.array, zip(*judged, strict=True))
+    curve = precision_recall(scores, correct, len(judged))
+    assert curve is not None
+    assert curve.recall_at(precision) == pytest.approx(best / len(judged))
 
 
 def test_distance_error_counts_queries_whose_first_match_lies_within_x_metres() -> None:
