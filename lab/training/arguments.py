@@ -161,7 +161,7 @@ class TrainingArguments(BaseModel):
     """Number of epochs."""
     max_steps: int | None = Field(None, ge=1)
     """Maximum number of steps; training may end within an epoch."""
-    seed: int = Field(1, ge=0)
+    seed: int = Field(1, ge=0, lt=2**32)
     """Random seed of weights, sampling and augmentation."""
 
     loss_name: str = "MultiSimilarityLoss"

@@ -240,16 +240,6 @@ def _not_resumable_error(path: Path, reason: str) -> Unprocessable:
     )
 
 
-def seed_everything(seed: int) -> None:
-    """Seed the global generators of torch, numpy and Python.
-
-    The sampler and the augmentation have generators of their own.
-    """
-    random.seed(seed)
-    np.random.seed(seed % 2**32)
-    torch.manual_seed(seed)
-
-
 def rng_state() -> dict[str, Any]:
     """Return the state of the global generators, in plain types and tensors."""
     name, keys, position, has_gauss, gauss = np.random.get_state(legacy=True)

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from lightning.fabric import seed_everything
+
 from lab.evaluation.ranking import RecallEvaluation
 from lab.training.arguments import (
     TrainingArguments,
@@ -15,7 +17,6 @@ from lab.training.arguments import (
     save_yaml,
     to_plain_dict,
 )
-from lab.training.checkpointing import seed_everything
 from lab.training.data import (
     EvaluationSets,
     select_evaluation_sets,
@@ -109,7 +110,7 @@ def run(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Js
             print_data_sets(training_set, sets, display)
         for note in list_changed_meanings(arguments):
             display.info(note)
-        seed_everything(arguments.seed)
+        seed_everything(arguments.seed, verbose=False)
         model = make_model(arguments, display, resuming=False)
     folder = Path() if arguments.fast_dev_run else create_run_folder(arguments)
     arguments = arguments.model_copy(update={"run_name": folder.name})
@@ -197,7 +198,7 @@ def _train(
         if resume_from is None:
             batches = arguments.num_sanity_val_steps
             validator.sanity_check(prepared.model, sets.validation, batches)
-            seed_everything(arguments.seed)
+            seed_everything(arguments.seed, verbose=False)
         else:
             loop.restore(resume_from)
         if arguments.fast_dev_run:

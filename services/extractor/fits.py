@@ -54,13 +54,6 @@ from shared.storage.open_store import open_store
 FIT_PROGRESS_UNITS = 100  # units of job progress for the fit itself: its steps in per cent
 READ_BATCH_BYTES = 16_000_000  # of descriptor rows read at once
 PCA_SEED = 0
-STAGES = {
-    "describing": "sample",
-    "clustering": "cluster",
-    "gathering": "gather",
-    "reducing": "reduce",
-}
-"""Job stages by those of `fit_vocabulary` and `fit_pca_stream`."""
 
 Report = Callable[[str, int, int], None]
 """Called with a stage, the steps done and their total."""
@@ -300,8 +293,7 @@ class FitWorker:
         )
         progress.check()
 
-        def report(step: str, done: int, total: int) -> None:
-            stage = STAGES[step]
+        def report(stage: str, done: int, total: int) -> None:
             if stage in ("sample", "gather"):
                 progress.update(min(done, sampled), stage)
             else:

@@ -227,12 +227,3 @@ def row_products(
             for i in range(query.shape[0]):
                 total += number(row[i]) * number(query[i])
         out[index] = total
-
-
-@numba_jit(REORDERED_FASTMATH)
-def squared_norm(row: NDArray[np.float32]) -> float:
-    """Sum of a row's squares, in float64."""
-    total = 0.0
-    for i in range(row.shape[0]):
-        total += np.float64(row[i]) * np.float64(row[i])
-    return total

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.search.chunk_loader import LoadedChunk
+from services.search.dense_scan import vector_length
 from services.search.exact_rerank import (
     Addresses,
     ExactReranker,
@@ -40,7 +41,6 @@ from services.search.kernels import (
     PLANES,
     add_hamming_distances,
     hamming_distances,
-    squared_norm,
     weighted_bit_sums,
 )
 from shared.codes.rotation import Rotation, get_rotation
@@ -119,7 +119,7 @@ class SignCodedQuery:
         quantized = integers * step + low
         product = float(np.einsum("ij,ij", quantized, rotated))
         squared_sum = float(np.einsum("ij,ij", quantized, quantized))
-        norm = math.sqrt(squared_norm(row))
+        norm = float(vector_length(row))
         plane_bits = (1 << np.arange(PLANES, dtype=np.uint8))[:, np.newaxis]
         return cls(
             row=row,

@@ -111,7 +111,7 @@ def fit_vocabulary(
         photos: Upper bound of the number of photos.
         clusters: Requested number of centres; fewer if there are too few patches.
         seed: Seed of the sampling and of k-means.
-        on_progress: Called with the stage (`describing`, `clustering`), the steps done and the
+        on_progress: Called with the stage (`sample`, `cluster`), the steps done and the
             total.
 
     Raises:
@@ -122,12 +122,12 @@ def fit_vocabulary(
         for batch in batches:
             patches.add(extractor.patch_features(batch), described, photos, seed)
             described += len(batch)
-            on_progress("describing", described, photos)
+            on_progress("sample", described, photos)
         fit = fit_centres(
             patches,
             clusters,
             seed,
-            lambda done, total: on_progress("clustering", done, total),
+            lambda done, total: on_progress("cluster", done, total),
             extractor.backbone.device,
         )
     provenance = fit_provenance(

@@ -181,7 +181,7 @@ def fit_pca_stream(
         max_rows: Maximum number of rows in all batches.
         dimension: Number of columns.
         components: Number of dimensions after the projection.
-        on_progress: Called with the stage (`gathering`, `reducing`), the rows or steps done and
+        on_progress: Called with the stage (`gather`, `reduce`), the rows or steps done and
             the total.
 
     Raises as `fit_pca` does.
@@ -193,12 +193,12 @@ def fit_pca_stream(
             file.write(np.ascontiguousarray(rows, np.float32).tobytes())
             kept += len(rows)
             seen += len(batch)
-            on_progress("gathering", seen, max_rows)
+            on_progress("gather", seen, max_rows)
         file.flush()
         check_pca_fittable(kept, dimension, components)
         stored = np.memmap(file, np.float32, "r", shape=(kept, dimension))
         return fit_pca(
             stored,
             components,
-            on_progress=lambda done, steps: on_progress("reducing", done, steps),
+            on_progress=lambda done, steps: on_progress("reduce", done, steps),
         )

@@ -119,10 +119,10 @@ def test_batches_are_fitted_as_their_usable_rows_in_memory() -> None:
     batches = [rows[begin : begin + 7] for begin in range(0, 50, 7)]
     steps: list[tuple[str, int, int]] = []
     fitted = fit_pca_stream(batches, 50, 200, 5, lambda *step: steps.append(step))
-    assert steps[7] == ("gathering", 50, 50)
+    assert steps[7] == ("gather", 50, 50)
     reducing = steps[8:]
     total = len(reducing)
-    assert reducing == [("reducing", done, total) for done in range(1, total + 1)]
+    assert reducing == [("reduce", done, total) for done in range(1, total + 1)]
     assert fitted.sha256 == fit_pca(np.delete(rows, [3, 9], axis=0), 5).sha256
 
 

@@ -28,6 +28,9 @@ DIMENSION = 7168
 
 Rows = NDArray[np.float32]
 
+LAST_DECIMAL = 1.5 * 10**-SCORE_DECIMALS
+"""Of a score, which may differ by one there: the order of a sum depends on the processor"""
+
 
 def photo(number: int) -> UUID:
     return UUID(int=number + 1)
@@ -78,17 +81,16 @@ def brute_force(
 def assert_best(found: list[tuple[UUID, float]], exact: dict[UUID, float], k: int) -> None:
     """Assert that these are the k best, ordered by score and then by id.
 
-    A score may differ by one in its last decimal: the order of a sum depends on the processor.
+    A score may differ by one in its last decimal.
     """
-    last_decimal = 1.5 * 10**-SCORE_DECIMALS
     assert len(found) == min(k, len(exact))
     assert found == sorted(found, key=lambda hit: (-hit[1], hit[0]))
-    assert all(abs(score - exact[photo_id]) < last_decimal for photo_id, score in found)
+    assert all(abs(score - exact[photo_id]) < LAST_DECIMAL for photo_id, score in found)
     if not found:
         return
     last_id, lowest = found[-1]
     for photo_id in exact.keys() - {photo_id for photo_id, _ in found}:
-        assert exact[photo_id] < lowest + last_decimal
+        assert exact[photo_id] < lowest + LAST_DECIMAL
         assert exact[photo_id] != exact[last_id] or photo_id > last_id
 
 

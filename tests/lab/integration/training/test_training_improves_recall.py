@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lightning.fabric import seed_everything
 
 from lab.datasets.open_dataset import open_evaluation_set
 from lab.evaluation.paired_runs import paired_differences
@@ -13,7 +14,6 @@ from lab.evaluation.query_clusters import cluster_queries
 from lab.evaluation.ranking import evaluate_recall
 from lab.evaluation.recall import compute_hits
 from lab.training.arguments import build_arguments
-from lab.training.checkpointing import seed_everything
 from lab.training.describing import ModelDescriber
 from lab.training.model_factory import make_model
 from lab.training.resolve import make_fabric
@@ -54,7 +54,7 @@ def test_a_short_run_clearly_beats_the_untrained_network_on_held_out_places(
     )
     report = train(fields)
     arguments = build_arguments(fields)
-    seed_everything(arguments.seed)
+    seed_everything(arguments.seed, verbose=False)
     untrained = make_model(arguments, NullDisplay(), resuming=False)
     trained = load_checkpoint(Path(report["best"]["path"])).model
     device, evaluation_set = make_fabric(arguments).device, open_evaluation_set(places)
