@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from lab.datasets.photo_lists import read_photo_list
 from lab.evaluation.exact_knn import Rankings
 from lab.evaluation.query_clusters import cluster_queries, singleton_clusters
 from lab.evaluation.ranking import DEFAULT_KS
-from lab.evaluation.report.page import write_report
+from lab.evaluation.report.page import format_share, write_report
 from lab.evaluation.results import (
     EvaluationResult,
     EvaluationRun,
@@ -32,7 +31,6 @@ from services.cli.evaluate import answers_table
 from services.cli.output import (
     Json,
     Table,
-    format_percent,
     print_json,
     print_message,
     print_table,
@@ -40,7 +38,6 @@ from services.cli.output import (
     refuse_unwritable,
 )
 from shared.errors import InvalidRequest
-from shared.evaluation.bootstrap import ConfidenceInterval
 
 
 def check_output_folders(out: Path | None, pairs: Path | None = None) -> None:
@@ -125,13 +122,11 @@ def _print_result(result: EvaluationResult) -> None:
     for at, (k, share) in enumerate(recalls.recall_all.items()):
         table.add_row(
             f"R@{k}",
-            _format_share(share, measured.recall_intervals, at),
-            _format_share(recalls.recall_findable[k], measured.findable_intervals, at),
+            format_share(share, measured.recall_intervals, at),
+            format_share(recalls.recall_findable[k], measured.findable_intervals, at),
         )
-    mean, interval = measured.mean_average_precision, measured.map_interval
-    table.add_row(
-        f"mAP@{measured.depth}", "", _format_share(mean, [interval] if interval else None, 0)
-    )
+    mean = format_share(measured.mean_average_precision, [measured.map_interval])
+    table.add_row(f"mAP@{measured.depth}", "", mean)
     print_table(table)
     print_message(
         f"Positive-match criterion: {evaluation_set.rule}; protocol {evaluation_set.protocol}; "
@@ -154,16 +149,6 @@ def _print_result(result: EvaluationResult) -> None:
                 f"{result.against.other}: {difference.won} queries gained, "
                 f"{difference.lost} lost."
             )
-
-
-def _format_share(
-    share: float, intervals: Sequence[ConfidenceInterval] | None, position: int
-) -> str:
-    if math.isnan(share):  # no query to average over
-        return "-"
-    if intervals is None:
-        return format_percent(share)
-    return f"{format_percent(share)} ({intervals[position].as_percent()})"
 
 
 PREDICTIONS_PROTOCOL = "predictions file"

@@ -58,17 +58,18 @@ def write_report(
     (out / "report.html").write_text(page, encoding="utf-8")
 
 
-def _format_share(
+def format_share(
     share: float, intervals: Sequence[ConfidenceInterval | None] | None, index: int = 0
 ) -> str:
+    """Return a share in per cent, with its interval if there is one; a dash for NaN."""
     interval = intervals[index] if intervals else None
     if interval is None or math.isnan(share):
         return _format_percent(share)
-    return f"{share:.1%} ({interval.as_percent()})"
+    return f"{_format_percent(share)} ({interval.as_percent()})"
 
 
 def _format_percent(share: float | None) -> str:
-    return "-" if share is None or math.isnan(share) else f"{share:.1%}"
+    return "-" if share is None or math.isnan(share) else f"{100 * share:.1f} %"
 
 
 def _format_number(value: float | None) -> str:
@@ -82,4 +83,4 @@ _templates = Environment(
     lstrip_blocks=True,
     undefined=StrictUndefined,
 )
-_templates.filters |= {"share": _format_share, "percent": _format_percent, "number": _format_number}
+_templates.filters |= {"share": format_share, "percent": _format_percent, "number": _format_number}
