@@ -63,8 +63,6 @@ def describe_photos(context: ExtractorContext, batch: JobBatch) -> Iterator[None
 
 @dataclass(slots=True)
 class _PreparedPhotos:
-    """The photos of a batch."""
-
     convert: Callable[[list[NDArray[Any]]], Rows]
     """Computes (n, dimension) rows of n inputs."""
     ready: list[Job] = field(default_factory=list)
@@ -153,7 +151,6 @@ def _decode_photos(
 
 
 def _preview_keys(job: Job) -> tuple[str | None, str | None]:
-    """Return the keys of a new photo's thumbnail and preview."""
     if job.kind == JobKind.DESCRIBE:
         return None, query_preview_key(job.id)
     if job.kind == JobKind.INDEX:

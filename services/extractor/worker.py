@@ -187,7 +187,6 @@ class ExtractorWorker:
             self._publishing.wait()
 
     def _claim(self, min_priority: int | None = None, *, alone: bool = True) -> JobBatch | None:
-        """Claim the next batch."""
         self._heartbeat.beat()  # for each batch: a drain may last for several
         claimed = self._runner.claim(
             self._fair_batch_size(), min_priority, alone=alone, started=False

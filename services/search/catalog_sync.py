@@ -173,7 +173,6 @@ def _with_codes(loader: ChunkLoader, chunks: list[LoadedChunk]) -> list[LoadedCh
 
 
 def _attach_codes(loader: ChunkLoader, chunk: LoadedChunk) -> LoadedChunk:
-    """Return the chunk with its sign codes."""
     stored = chunk.stored
     if stored is None or stored.codes is not None:
         return chunk

@@ -118,7 +118,6 @@ def hamming_distances(
 def _address(
     block_addresses: Addresses, first_rows: NDArray[np.int64], row: int, row_bytes: int
 ) -> np.uint64:
-    """Address of a row."""
     block = np.searchsorted(first_rows, row, side="right") - 1
     return block_addresses[block] + np.uint64((row - first_rows[block]) * row_bytes)
 

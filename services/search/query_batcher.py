@@ -22,8 +22,6 @@ MAX_BATCH_QUERIES = 32
 
 @dataclass(slots=True, eq=False)
 class _QueuedQuery:
-    """A query that waits for its scan."""
-
     blocks: SignCodeBlocks
     query: SignCodedQuery
     row_mask: NDArray[np.bool_]

@@ -285,7 +285,6 @@ class SignCodeSearch:
         return int(bits / math.pi * math.acos(min(1.0, max(-1.0, min_cosine))))
 
     def _add_distances(self, rows: Indices, level: int, distances: Indices) -> None:
-        """Add the distances in the bits of a level."""
         begin, end = int(self._level_ends[level - 1]), int(self._level_ends[level])
         bits = self._query.bits[begin:end]
         codes, first_rows = self._blocks.level_addresses[level], self._blocks.first_rows

@@ -61,8 +61,6 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class _DeliveryAttempt:
-    """The result of an attempt."""
-
     status: int | None
     """HTTP status; None without a response."""
     error: str | None
@@ -236,7 +234,6 @@ class WebhookDispatcher:
             return list(session.scalars(due.distinct()))
 
     def _has_pending(self) -> bool:
-        """Return whether a delivery waits for its next attempt."""
         pending = exists().where(Delivery.state == DeliveryState.PENDING)
         with self._catalog.read() as session:
             return bool(session.scalar(select(pending)))

@@ -122,7 +122,6 @@ def decode_centres(data: bytes, *, width: int | None = None) -> ClusterCentres:
 
 
 def _encode_array(array: NDArray[Any]) -> bytes:
-    """Encode the array as a `.npy` file."""
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
     return buffer.getvalue()

@@ -242,7 +242,6 @@ def _parse_options(name: str, option_text: str) -> dict[str, str]:
 
 
 def _parse_input(name: str, options: dict[str, str]) -> NetworkInput:
-    """Return the input that the options `input.…` describe."""
     fields: dict[str, Any] = {}
     for option, value in options.items():
         if "." not in option:

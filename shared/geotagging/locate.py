@@ -114,7 +114,6 @@ def probable_label(estimate: EstimateResponse) -> tuple[str | None, float | None
 
 
 def _pose_position(pose: CameraPoseResponse | None) -> PosePosition | None:
-    """Return the pose, if it has coordinates."""
     if pose is None or pose.latitude is None or pose.longitude is None:
         return None
     if pose.radius_68_m is None or pose.heading is None:

@@ -123,8 +123,6 @@ def verify_store(
 
 
 class _Verifier:
-    """Verifies single objects and counts them in `report`."""
-
     def __init__(self, catalog: Catalog, store: ObjectStore, *, originals: bool) -> None:
         self._catalog = catalog
         self._store = store

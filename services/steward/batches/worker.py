@@ -74,8 +74,6 @@ OBJECT_READ_BYTES = 256 * 1024
 
 
 class _BatchItemImporter:
-    """Imports batch items."""
-
     def __init__(
         self, catalog: Catalog, store: ObjectStore, wakeups: Wakeups, settings: Settings
     ) -> None:
@@ -125,13 +123,11 @@ class _BatchItemImporter:
             self._store.delete(result.unused_key)
 
     def _reserve_quota(self, job: Job, key_id: UUID | None) -> AbstractContextManager[None]:
-        """Reserve a photo in the quota of the batch's API key."""
         if key_id is None or job.params["max_photos"] is None:
             return contextlib.nullcontext()
         return self._quota.reserve(key_id, job.params["max_photos"])
 
     def _received_upload(self, item: BatchItem) -> StoredUpload:
-        """Return the file that the gateway has stored."""
         assert item.object_key is not None
         return StoredUpload(
             key=item.object_key,

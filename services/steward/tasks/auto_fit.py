@@ -71,7 +71,6 @@ def is_fit_due(session: Session, map_: Map) -> bool:
 
 
 def _has_queued_photos(session: Session, map_id: UUID) -> bool:
-    """Return whether photos or batches are queued."""
     queued = exists().where(
         Job.map_id == map_id,
         Job.kind.in_((JobKind.INDEX, JobKind.BATCH)),
