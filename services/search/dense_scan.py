@@ -77,8 +77,8 @@ def _rescore(
     snapshot: Snapshot, query: QueryRow, rows: RowNumbers, scores: NDArray[Any], min_score: float
 ) -> tuple[RowNumbers, Scores]:
     """Return the rows whose cosine may be at least `min_score`, and their float64 cosines."""
-    # Answers have no score above 1, which a float16 row may exceed: such rows are equal.
-    near = rows[scores >= min(min_score, 1.0) - float32_error(len(query))]
+    # Answers have no score beyond -1 and 1, which a float16 row may exceed: such rows are equal.
+    near = rows[np.maximum(scores, -1.0) >= min(min_score, 1.0) - float32_error(len(query))]
     return near, exact_scores(snapshot, query, near)
 
 
