@@ -17,7 +17,6 @@ from placewise.protocol import (
     API,
     POLL_SECONDS,
     Json,
-    ReadProgressFile,
     drop_none,
     open_file,
     printable_name,
@@ -53,8 +52,7 @@ class AsyncClient(AsyncTransport):
             Unprocessable: A field or the image is invalid.
         """
         data = {name: str(value) for name, value in drop_none(**fields).items()}
-        file = Path(photo) if isinstance(photo, (str, Path)) else photo
-        return answers.Uploaded(**await self._send_file("/upload", file, filename, data=data))
+        return answers.Uploaded(**await self._send_file("/upload", photo, filename, data=data))
 
     async def upload_direct(
         self, /, photo: str | Path, filename: str | None = None, **fields: Any
@@ -100,9 +98,8 @@ class AsyncClient(AsyncTransport):
 
         Each manifest entry contains an object `key` and fields of `upload`; bytes are JSONL.
         """
-        body = manifest if isinstance(manifest, bytes) else to_jsonl(manifest)
-        headers = {"Content-Type": "application/x-ndjson"}
-        return await self._start_batch(content=body, headers=headers)
+        data = manifest if isinstance(manifest, bytes) else to_jsonl(manifest)
+        return await self._start_batch(files={"manifest": ("manifest.jsonl", data)})
 
     async def sync_library(self, *, every_hours: int | None = None) -> answers.Started:
         """Bring the map up to date with the photo library of the server's settings.
@@ -179,8 +176,7 @@ class AsyncClient(AsyncTransport):
             file_id = photo.image_id if isinstance(photo, answers.Photo) else photo
             answer = await self._call("POST", f"/similarity/{file_id}", **options)
         else:
-            file = Path(photo) if isinstance(photo, (str, Path)) else photo
-            answer = await self._send_file("/similarity", file, **options)
+            answer = await self._send_file("/similarity", photo, **options)
         if "result_url" in answer:
             async for _ in self.watch(answer["job_id"]):
                 pass
@@ -264,7 +260,7 @@ class AsyncClient(AsyncTransport):
         )
         answer = await self._send_file(
             f"/tracks/{track_id}/frames",
-            Path(photo),
+            photo,
             data={name: str(value) for name, value in fields.items()},
             headers={"Prefer": f"wait={POLL_SECONDS:g}"} if wait else {},
         )
@@ -427,7 +423,7 @@ class AsyncClient(AsyncTransport):
 
     async def import_vocabulary(self, file: str | Path) -> answers.Started:
         """Start reindexing the map with a vocabulary from a `.npz` or `.npy` file."""
-        return answers.Started(**await self._send_file("/vocabularies/import", Path(file)))
+        return answers.Started(**await self._send_file("/vocabularies/import", file))
 
     async def vocabularies(self) -> list[answers.Vocabulary]:
         """List the map's vocabularies, newest first."""
@@ -611,25 +607,24 @@ class AsyncClient(AsyncTransport):
 
     async def add_model(
         self,
-        checkpoint: str | Path,
+        checkpoint: str | Path | BinaryIO,
         name: str,
         *,
         options: str | None = None,
         licence: str | None = None,
         note: str | None = None,
-        on_sent: Callable[[int], object] = lambda sent_bytes: None,
+        filename: str | None = None,
     ) -> answers.Started:
         """Start adding a checkpoint, TorchScript or ONNX file as an extractor.
 
         Args:
+            checkpoint: The file: its path, or open for reading bytes.
             name: Permanent name; maps refer to it as `gsv:NAME`, `torchscript:NAME` or `onnx:NAME`.
             options: Of a TorchScript or ONNX file: `input.size=288x288,aggregator=vlad`.
-            on_sent: Called with the number of bytes sent so far.
+            filename: Name of an open file; None for the name of the path.
         """
         data = drop_none(name=name, options=options, licence=licence, note=note)
-        with open_file(Path(checkpoint)) as file:
-            files = {"file": (printable_name(Path(checkpoint)), ReadProgressFile(file, on_sent))}
-            return answers.Started(**await self._call("POST", "/models", files=files, data=data))
+        return answers.Started(**await self._send_file("/models", checkpoint, filename, data=data))
 
     async def models(self) -> list[answers.AddedModel]:
         """List the added models."""

@@ -17,6 +17,7 @@ from placewise.protocol import (
     API,
     CHUNK_BYTES,
     IDEMPOTENCY_KEY,
+    PATIENCE_SECONDS,
     TIMEOUT_SECONDS,
     Json,
     OnWait,
@@ -42,25 +43,36 @@ class AsyncTransport:
     def __init__(
         self,
         url: str,
-        map_name: str | None = None,
-        key: str | None = None,
         *,
-        patience_seconds: float = 0.0,
-        on_wait: OnWait = lambda error, seconds: None,
+        key: str | None = None,
+        map: str | None = None,  # noqa: A002
+        patience_seconds: float = PATIENCE_SECONDS,
         timeout_seconds: float = TIMEOUT_SECONDS,
     ) -> None:
-        """Create a client; `placewise.connect` explains the arguments.
+        """Create a client of a server and one of its maps. No request is sent yet.
+
+        Calls are retried with exponential backoff while the server is unavailable (503, 507, no
+        connection), and as its Retry-After says while it is busy (429). Every POST carries an
+        Idempotency-Key, so that a retried call takes effect once. Files to upload are read in the
+        thread of the caller, of an asynchronous client in that of the event loop.
 
         Args:
-            on_wait: Called before each retry with the error and the seconds until then.
+            url: URL of the server, such as `http://127.0.0.1:8000`.
+            key: API key; a server on a loopback address may not require one.
+            map: Name of the map; None for `default`.
+            patience_seconds: How long calls are retried; 0 disables retries.
+            timeout_seconds: Timeout of a single call, in seconds without a byte from the server.
+
+        Raises:
+            InvalidRequest: `bad_address`, `bad_key`.
         """
         self.url = validate_url(url, key)
-        self._patience = RetryPolicy(patience_seconds, on_wait)
+        self._patience = RetryPolicy(patience_seconds)
         self._timeout_seconds = timeout_seconds
         self._open(
             base_url=self.url,
             timeout=timeout_seconds,
-            params={"map": map_name} if map_name else None,
+            params={"map": map} if map else None,
             headers={"Authorization": f"Bearer {key}"} if key else None,
         )
 
@@ -109,7 +121,7 @@ class AsyncTransport:
         """Return a client that shares the connections and retries calls for another period.
 
         Args:
-            patience_seconds: How long calls are retried; see `connect`.
+            patience_seconds: How long calls are retried.
             on_wait: Called before each wait with the error and the number of seconds.
         """
         other = copy.copy(self)
@@ -117,13 +129,13 @@ class AsyncTransport:
         return other
 
     async def _send_file(
-        self, path: str, file: Path | BinaryIO, filename: str | None = None, **options: Any
+        self, path: str, file: str | Path | BinaryIO, filename: str | None = None, **options: Any
     ) -> Any:
         """POST a file, by its path or open, as the form field `file`, streamed."""
         with contextlib.ExitStack() as stack:
-            if isinstance(file, Path):
-                filename = filename or printable_name(file)
-                file = stack.enter_context(open_file(file))
+            if isinstance(file, (str, Path)):
+                filename = filename or printable_name(Path(file))
+                file = stack.enter_context(open_file(Path(file)))
             files = {"file": (filename or "photo", file)}
             return await self._call("POST", path, files=files, **options)
 

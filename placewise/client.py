@@ -15,7 +15,7 @@ from typing import Any, BinaryIO, Concatenate, ParamSpec, Self, TypeVar, cast
 import httpx2
 
 from placewise.async_client import AsyncClient, Work
-from placewise.protocol import CHUNK_BYTES, TIMEOUT_SECONDS, Json, OnWait
+from placewise.protocol import CHUNK_BYTES, PATIENCE_SECONDS, TIMEOUT_SECONDS, Json, OnWait
 
 __all__ = ["Client", "Work"]
 
@@ -99,24 +99,18 @@ class Client:
     def __init__(
         self,
         url: str,
-        map_name: str | None = None,
-        key: str | None = None,
         *,
-        patience_seconds: float = 0.0,
-        on_wait: OnWait = lambda error, seconds: None,
+        key: str | None = None,
+        map: str | None = None,  # noqa: A002
+        patience_seconds: float = PATIENCE_SECONDS,
         timeout_seconds: float = TIMEOUT_SECONDS,
     ) -> None:
-        """Create a client; `placewise.connect` explains the arguments.
-
-        Args:
-            on_wait: Called before each retry with the error and the seconds until then.
-        """
+        """Create a client; the parameters are those of `AsyncClient`."""
         self._calls: AsyncClient = _BlockingCalls(
             url,
-            map_name,
-            key,
+            key=key,
+            map=map,
             patience_seconds=patience_seconds,
-            on_wait=on_wait,
             timeout_seconds=timeout_seconds,
         )
         self.url = self._calls.url
@@ -135,7 +129,7 @@ class Client:
         """Return a client that shares the connections and retries calls for another period.
 
         Args:
-            patience_seconds: How long calls are retried; see `connect`.
+            patience_seconds: How long calls are retried.
             on_wait: Called before each wait with the error and the number of seconds.
         """
         other = copy.copy(self)

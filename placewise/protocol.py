@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
 import json
 import os
 import random
@@ -25,6 +24,7 @@ from shared.errors import (
 API = "/api/v1"
 IDEMPOTENCY_KEY = "Idempotency-Key"
 POLL_SECONDS = 20.0  # duration of a long poll
+PATIENCE_SECONDS = 60.0  # for which calls are retried
 TIMEOUT_SECONDS = 90.0  # per call; exceeds the longest long poll that a server allows
 CHUNK_BYTES = 256 * 1024
 INITIAL_BACKOFF_SECONDS = 0.5  # doubles with each attempt, without Retry-After
@@ -104,12 +104,7 @@ def open_file(file: Path) -> Iterator[BinaryIO]:
         with file.open("rb") as stream:
             yield stream
     except OSError as error:
-        raise unreadable_file_error(file, error) from error
-
-
-def unreadable_file_error(file: Path, error: OSError) -> InvalidRequest:
-    """The error of a file that can't be read."""
-    return InvalidRequest("unreadable_file", f"Can't read {file}: {error.strerror}")
+        raise InvalidRequest("unreadable_file", f"Can't read {file}: {error.strerror}") from error
 
 
 def printable_name(file: Path) -> str:
@@ -131,29 +126,3 @@ def drop_none(**params: Any) -> Json:
 def to_jsonl(objects: Sequence[Json]) -> bytes:
     """Encode objects as JSONL."""
     return b"".join(json.dumps(item).encode() + b"\n" for item in objects)
-
-
-class ReadProgressFile(io.BufferedIOBase):
-    """A file wrapper that reports the position after each read."""
-
-    def __init__(self, file: BinaryIO, on_read: Callable[[int], object]) -> None:
-        self._file = file
-        self._on_read = on_read
-
-    def read(self, size: int | None = -1) -> bytes:
-        data = self._file.read(-1 if size is None else size)
-        self._on_read(self._file.tell())
-        return data
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        return self._file.seek(offset, whence)
-
-    def tell(self) -> int:
-        return self._file.tell()
-
-    def fileno(self) -> int:
-        return self._file.fileno()
-
-    def close(self) -> None:
-        self._file.close()
-        super().close()

@@ -3,7 +3,7 @@
 In the server's process, each photo would wait for the threads of uploads and searches, and each
 query for those of the extractor. Both processes use the same catalog and object store. What else
 they would share in one process passes through two pipes: that something was committed or queued,
-log records, metrics, and the error with which the extractor ends.
+metrics, and the error with which the extractor ends.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
-from logging import LogRecord, getLogger
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -42,7 +41,7 @@ from shared.errors import Misconfigured, PlacewiseError
 from shared.jobs import InProcessWakeups
 from shared.jobs.runner import IDLE_POLL_SECONDS, JobRunner
 from shared.storage import ObjectStore
-from shared.telemetry.logs import forward_logs
+from shared.telemetry.logs import configure_logging
 
 # Commands are single bytes: any number of them is one. The end of their pipe means: stop.
 LOOK, REPORT_METRICS = b"l", b"m"
@@ -52,8 +51,8 @@ ORPHAN_SECONDS = 30.0  # for the extractor of a killed server to end
 # A terminal and systemd send them to both processes; the server's end is what stops the extractor.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-Message = LogRecord | PlacewiseError | str | None
-"""From the extractor: a log record, the error it ends with, its metrics, or None: a commit."""
+Message = PlacewiseError | str | None
+"""From the extractor: the error it ends with, its metrics, or None: a commit."""
 
 
 def extractor_lock(home: Path) -> FileLock:
@@ -105,8 +104,6 @@ class ExtractorProcess(Collector):
                 message: Message = self._messages.recv()
                 if isinstance(message, PlacewiseError):
                     error = message
-                elif isinstance(message, LogRecord):
-                    getLogger(message.name).handle(message)
                 elif isinstance(message, str):
                     self._take_metrics(message)
                 else:
@@ -255,7 +252,7 @@ def _run(
         with sending:
             messages.send(message)
 
-    forward_logs(settings, send)
+    configure_logging(settings, "embedded", for_operators=False)
     try:
         _Extractor(settings, name, send).serve(commands, lazy=lazy)
     except PlacewiseError as error:

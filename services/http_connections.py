@@ -1,26 +1,29 @@
 """Connection limits of an HTTP server: the number of connections, and timeouts for slow clients.
 
 uvicorn has no such limits, and without them a few slow clients can use up all file descriptors
-(Slowloris). `LimitedProtocol` adds them to uvicorn's HTTP/1.1 protocol:
+(Slowloris). `LimitedProtocol` adds them to uvicorn's HTTP/1.1 protocol, and `receive_in_time` to
+the bodies that an application reads:
 
 | | limit | when exceeded |
 |---|---|---|
 | connections in total | MAX_CONNECTIONS | the longest idle one is closed; 503 if none is idle |
 | connections per address | MAX_CONNECTIONS_PER_ADDRESS | the same, with 429 |
-| request head | HEAD_SECONDS | 408; closed if nothing was received |
+| request head | HEAD_SECONDS | closed |
 | request body | BODY_BYTES_PER_SECOND | 408 |
 | client does not read the response | STALLED_SECONDS | closed |
 """
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import errno
 import json
 import logging
 import resource
 import time
-from collections import Counter, defaultdict
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from http import HTTPStatus
@@ -32,25 +35,23 @@ from ipaddress import (
     ip_address,
     ip_network,
 )
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import h11
+from starlette.types import Message, Receive
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, RequestTimeout, TooManyRequests, Unavailable
-from shared.http.problem_details import CLOSED_STATUS_SCOPE_KEY
 
 log = logging.getLogger(__name__)
 
 HEAD_SECONDS = 20.0
 BODY_BYTES_PER_SECOND = 1000
-# Window over which the rate of a body is measured, and so the longest pause of a client. Windows in
-# which the server itself paused reading do not count.
 BODY_WINDOW_SECONDS = 10.0
+"""Of waiting for a body, over which its rate is measured, and so the longest pause of a client"""
 STALLED_SECONDS = 75.0  # within which a client must read a part of its response
 RETRY_SECONDS = 1
-LOG_SECONDS = 60.0  # between two log lines about closed connections
 MAX_OPEN_FILES = 65_536  # file limit that is requested from the system, at most
 RESERVED_FILES = 256  # for the catalog, chunks, uploads and other services of the process
 
@@ -114,10 +115,8 @@ class Connections:
         self.closed = Counter(dict.fromkeys(Reason, 0))
         self._open: dict[LimitedProtocol, None] = {}
         self._count_by_group: Counter[str] = Counter()
-        self._idle: defaultdict[str, dict[LimitedProtocol, None]] = defaultdict(dict)
-        """Connections without a request in flight, by address group; longest idle first."""
-        self._logged = Counter(self.closed)
-        self._next_log = 0.0
+        self._idle: dict[LimitedProtocol, None] = {}
+        """Connections without a request in flight; longest idle first."""
 
     @property
     def count(self) -> int:
@@ -132,23 +131,18 @@ class Connections:
         """
         group, limits = connection.group, self.limits
         group_limit = limits.of_address(connection.address)
-        if (
-            group_limit
-            and self._count_by_group[group] >= group_limit
-            and not self._close_idle(group, Reason.ADDRESS_LIMIT)
+        if group_limit and self._count_by_group[group] >= group_limit:
+            of_group = (idle for idle in self._idle if idle.group == group)
+            if not self._close_first(of_group, Reason.ADDRESS_LIMIT):
+                return TooManyRequests(
+                    "too_many_connections",
+                    f"Your address has {group_limit} connections with requests in flight "
+                    "(MAX_CONNECTIONS_PER_ADDRESS). Try again when one of them has ended.",
+                    retry_after_seconds=RETRY_SECONDS,
+                )
+        if self.count >= limits.total and not self._close_first(
+            iter(self._idle), Reason.TOTAL_LIMIT
         ):
-            self.closed[Reason.ADDRESS_LIMIT] += 1
-            return TooManyRequests(
-                "too_many_connections",
-                f"Your address has {group_limit} connections with requests in flight "
-                "(MAX_CONNECTIONS_PER_ADDRESS). Try again when one of them has ended.",
-                retry_after_seconds=RETRY_SECONDS,
-            )
-        if self.count >= limits.total and not self._close_idle(
-            max(self._idle, key=lambda group: len(self._idle[group]), default=group),
-            Reason.TOTAL_LIMIT,
-        ):
-            self.closed[Reason.TOTAL_LIMIT] += 1
             return Unavailable(
                 "too_many_connections",
                 f"The server has {limits.total} connections with requests in flight "
@@ -157,7 +151,7 @@ class Connections:
             )
         self._open[connection] = None
         self._count_by_group[group] += 1
-        self.mark_idle(connection)
+        self.mark(connection, idle=True)
         return None
 
     def remove(self, connection: LimitedProtocol) -> None:
@@ -165,36 +159,23 @@ class Connections:
         if connection not in self._open:
             return
         del self._open[connection]
-        self.mark_busy(connection)
+        self.mark(connection, idle=False)
         self._count_by_group[connection.group] -= 1
         if not self._count_by_group[connection.group]:
             del self._count_by_group[connection.group]
 
-    def mark_idle(self, connection: LimitedProtocol) -> None:
-        """Mark a connection without a request in flight: it may be closed for a new one."""
-        if connection in self._open:
-            self._idle[connection.group].setdefault(connection)
-
-    def mark_busy(self, connection: LimitedProtocol) -> None:
-        """Mark a connection with a request in flight."""
-        idle = self._idle.get(connection.group, {})
-        idle.pop(connection, None)
-        if not idle:
-            self._idle.pop(connection.group, None)
+    def mark(self, connection: LimitedProtocol, *, idle: bool) -> None:
+        """Note whether a connection has no request in flight: then it may be closed for another."""
+        if idle and connection in self._open:
+            self._idle.setdefault(connection)
+        else:
+            self._idle.pop(connection, None)
 
     def check(self) -> None:
-        """Close connections of slow clients and log the counts; called about once a second."""
+        """Close connections of slow clients; called about once a second."""
         now = time.monotonic()
         for connection in list(self._open):
             connection.check(now)
-        if self.closed != self._logged and now >= self._next_log:
-            new = self.closed - self._logged
-            self._logged, self._next_log = Counter(self.closed), now + LOG_SECONDS
-            log.warning(
-                "Connections closed or refused: %s; open now: %d",
-                ", ".join(f"{reason} {count}" for reason, count in sorted(new.items())),
-                self.count,
-            )
 
     def on_loop_error(self, loop: Any, context: dict[str, Any]) -> None:
         """Exception handler of the event loop that counts failed accepts.
@@ -213,13 +194,13 @@ class Connections:
         else:
             loop.default_exception_handler(context)
 
-    def _close_idle(self, group: str, reason: Reason) -> bool:
-        """Close the longest idle connection of the group; False if none is idle."""
-        oldest = next(iter(self._idle.get(group, ())), None)
-        if oldest is None:
-            return False
+    def _close_first(self, idle: Iterator[LimitedProtocol], reason: Reason) -> bool:
+        """Close the first of these connections; False if there is none."""
         self.closed[reason] += 1
-        oldest.close()
+        connection = next(idle, None)
+        if connection is None:
+            return False
+        connection.close()
         return True
 
 
@@ -232,10 +213,6 @@ class LimitedProtocol(H11Protocol):
         self._connections = connections
         self._head_since: float | None = None
         """When the server began to wait for a request head; None while it does not wait."""
-        self._window_since: float | None = None
-        """Start of the body's rate window; None while no body is received."""
-        self._window_bytes = 0
-        self._paused = False  # whether reading was paused in this window
         self._unsent_bytes = 0
         self._unsent_since = 0.0
 
@@ -254,7 +231,6 @@ class LimitedProtocol(H11Protocol):
 
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
-        self._window_bytes += len(data)
         self._note_state()
         if self.conn.their_state is h11.IDLE and self._head_since is None:
             self._head_since = time.monotonic()
@@ -268,18 +244,12 @@ class LimitedProtocol(H11Protocol):
         self._unsent_since = time.monotonic()
 
     def _note_state(self) -> None:
-        state = self.conn.their_state
-        if state is h11.IDLE:
-            self._connections.mark_idle(self)
-        else:
+        waits_for_head = self.conn.their_state is h11.IDLE
+        if not waits_for_head:
             self._head_since = None
-            self._connections.mark_busy(self)
-        if state is not h11.SEND_BODY:
-            self._window_since = None
-        elif self._window_since is None:
-            self._begin_window(time.monotonic())
-        else:
-            self._paused |= self.flow.read_paused
+        # The rest of a body that the response did not need may never come.
+        is_answered = self.cycle is not None and self.cycle.response_complete
+        self._connections.mark(self, idle=waits_for_head or is_answered)
 
     def check(self, now: float) -> None:
         """Close the connection if its client is too slow."""
@@ -293,57 +263,65 @@ class LimitedProtocol(H11Protocol):
             self.close()
         elif self._head_since is not None and now - self._head_since > limits.head_seconds:
             self._connections.closed[Reason.SLOW_HEAD] += 1
-            if self.conn.trailing_data[0]:
-                self._refuse(
-                    RequestTimeout(
-                        "request_too_slow",
-                        "The head of the request was not received within "
-                        f"{limits.head_seconds:g} seconds.",
-                    )
-                )
-            else:
-                self.close()
-        elif (
-            self._window_since is not None
-            and now - self._window_since >= limits.body_window_seconds
-        ):
-            min_bytes = limits.body_bytes_per_second * (now - self._window_since)
-            server_paused = self._paused or self.cycle.waiting_for_100_continue
-            if self._window_bytes < min_bytes and not server_paused:
-                self._connections.closed[Reason.SLOW_BODY] += 1
-                self._refuse(
-                    RequestTimeout(
-                        "request_too_slow",
-                        "The body was received at "
-                        f"{self._window_bytes / (now - self._window_since):.0f} bytes per second; "
-                        f"at least {limits.body_bytes_per_second} are required. "
-                        "Send the request again.",
-                    )
-                )
-            else:
-                self._begin_window(now)
+            self.close()
 
     def close(self) -> None:
         """Abort the connection at once."""
         self._connections.remove(self)
         self.transport.abort()
 
-    def _begin_window(self, now: float) -> None:
-        self._window_since, self._window_bytes = now, 0
-        self._paused = self.flow.read_paused
-
     def _refuse(self, error: PlacewiseError) -> None:
-        """Send the problem, unless a response has started, and close the connection."""
-        self._connections.remove(self)
-        self._head_since = self._window_since = None
-        in_flight = self.cycle is not None and not self.cycle.response_complete
-        if not (in_flight and self.cycle.response_started):
-            self.transport.write(_problem_response_bytes(error))
-        if in_flight:
-            cast(dict[str, Any], self.scope)[CLOSED_STATUS_SCOPE_KEY] = error.status
-            self.cycle.disconnected = True  # uvicorn drops the response of the application
-            self.cycle.message_event.set()
+        """Send the problem to a client that has sent nothing yet, and close the connection."""
+        self._head_since = None
+        body = json.dumps(error.as_problem()).encode()
+        headers = {
+            "Content-Type": "application/problem+json",
+            "Content-Length": str(len(body)),
+            "Connection": "close",
+            "Retry-After": str(RETRY_SECONDS),
+        }
+        head = h11.Response(
+            status_code=error.status,
+            reason=HTTPStatus(error.status).phrase,
+            headers=list(headers.items()),
+        )
+        for event in (head, h11.Data(data=body), h11.EndOfMessage()):
+            self.transport.write(self.conn.send(event) or b"")
         self.transport.close()
+
+
+def receive_in_time(receive: Receive, connections: Connections) -> Receive:
+    """Return a `receive` that raises RequestTimeout (`request_too_slow`) for slow bodies.
+
+    Only the time counts in which the application waits for the client.
+    """
+    limits = connections.limits
+    waited, received_bytes, complete = 0.0, 0, not limits.body_bytes_per_second
+
+    async def limited() -> Message:
+        nonlocal waited, received_bytes, complete
+        message: Message | None = None
+        while not complete and message is None:
+            begun = time.monotonic()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(limits.body_window_seconds):
+                    message = await receive()
+                received_bytes += len(message.get("body", b""))
+                complete = not message.get("more_body")
+            waited += time.monotonic() - begun
+            if waited < limits.body_window_seconds or complete:
+                continue
+            if received_bytes < limits.body_bytes_per_second * waited:
+                connections.closed[Reason.SLOW_BODY] += 1
+                raise RequestTimeout(
+                    "request_too_slow",
+                    f"The body was received at {received_bytes / waited:.0f} bytes per second; at "
+                    f"least {limits.body_bytes_per_second} are required. Send the request again.",
+                )
+            waited, received_bytes = 0.0, 0
+        return message or await receive()
+
+    return limited
 
 
 def address_group(address: str) -> str:
@@ -384,18 +362,3 @@ def _raise_file_limit() -> int:
     except (OSError, ValueError):  # macOS refuses values below its reported hard limit
         return soft
     return target
-
-
-def _problem_response_bytes(error: PlacewiseError) -> bytes:
-    """A complete HTTP/1.1 response with the problem."""
-    body = json.dumps(error.as_problem()).encode()
-    status = HTTPStatus(error.status)
-    head = [
-        f"HTTP/1.1 {status.value} {status.phrase}",
-        "Content-Type: application/problem+json",
-        f"Content-Length: {len(body)}",
-        "Connection: close",
-    ]
-    if "retry_after_seconds" in error.extra:
-        head.append(f"Retry-After: {error.extra['retry_after_seconds']}")
-    return "\r\n".join(head).encode() + b"\r\n\r\n" + body

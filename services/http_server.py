@@ -16,7 +16,7 @@ from fastapi import FastAPI
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
-from services.http_connections import Connections, LimitedProtocol
+from services.http_connections import Connections, LimitedProtocol, receive_in_time
 from shared.errors import Misconfigured
 from shared.security.api_keys import is_loopback
 
@@ -72,7 +72,7 @@ def http_server(
     server = _NotifyingServer(
         uvicorn.Config(
             # Instead of uvicorn's own, which would replace the address before it can be recorded.
-            _record_peer(forwarded),
+            _limit_bodies(forwarded, connections),
             proxy_headers=False,
             loop="asyncio",
             http=partial(LimitedProtocol, connections),  # type: ignore[arg-type]
@@ -88,15 +88,20 @@ def http_server(
     return server
 
 
-def _record_peer(app: ASGIApp) -> ASGIApp:
-    """Record the address of the connection in the scope, before `X-Forwarded-For` replaces it."""
+def _limit_bodies(app: ASGIApp, connections: Connections) -> ASGIApp:
+    """Limit the time that bodies take, and record the address of the connection in the scope.
 
-    async def recording(scope: Scope, receive: Receive, send: Send) -> None:
+    The latter before `X-Forwarded-For` replaces it.
+    """
+
+    async def limited(scope: Scope, receive: Receive, send: Send) -> None:
         if client := scope.get("client"):
             scope[PEER_ADDRESS] = client[0]
+        if scope["type"] == "http":
+            receive = receive_in_time(receive, connections)
         await app(scope, receive, send)
 
-    return recording
+    return limited
 
 
 @contextlib.contextmanager

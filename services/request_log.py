@@ -16,7 +16,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from shared.errors import Unavailable
 from shared.http.problem_details import (
     CLIENT_GONE,
-    CLOSED_STATUS_SCOPE_KEY,
     REQUEST_ID_SCOPE_KEY,
     problem_response,
 )
@@ -120,8 +119,8 @@ class RequestLogMiddleware:
                 response = problem_response(stopping, Request(scope))
                 await response(scope, receive, send_with_request_id)
             finally:
-                if disconnected or CLOSED_STATUS_SCOPE_KEY in scope:
-                    record.status = scope.get(CLOSED_STATUS_SCOPE_KEY, CLIENT_GONE)
+                if disconnected:
+                    record.status = CLIENT_GONE
                 record.route = _route_template(scope)
                 self._on_end(record)
                 self._log(record, scope, time.perf_counter() - started)

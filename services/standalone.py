@@ -8,7 +8,6 @@ docs/architecture.md lists.
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import socket
 import threading
@@ -53,8 +52,6 @@ from shared.jobs import InProcessWakeups
 from shared.security.api_keys import Scope, generate_local_key, hash_api_key, is_loopback
 from shared.telemetry.logs import configure_logging
 from shared.telemetry.metrics_server import serve_metrics
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)

@@ -7,6 +7,7 @@ import contextlib
 import gc
 import os
 import shutil
+import sys
 from collections.abc import Generator, Iterator
 from pathlib import Path
 
@@ -16,6 +17,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
+import execnet
 import pytest
 from sqlalchemy.engine import make_url
 
@@ -25,12 +27,11 @@ from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.storage import FolderStore
 from tests.support.compiled_statements import share_compiled_statements
+from tests.support.processes import forked_command
 from tests.support.servers import (
-    MilvusServer,
     PostgresServer,
     RedisServer,
     S3Server,
-    start_milvus,
     start_moto,
     start_postgres,
     start_redis,
@@ -38,11 +39,13 @@ from tests.support.servers import (
 )
 from tests.support.spare_databases import SpareDatabases
 
+FORKED_WORKERS = pytest.StashKey[bool]()
 REAL_PHOTOS = "PLACEWISE_TEST_DATA"
 BROWSER = "PLACEWISE_TEST_BROWSER"
 IMAGES = "PLACEWISE_TEST_IMAGES"
 CHAOS = "PLACEWISE_TEST_CHAOS"
-SERVER_FIXTURES = frozenset({"milvus_server", "postgres", "redis", "s3", "moto"})
+LAB = "PLACEWISE_TEST_LAB"
+SERVER_FIXTURES = frozenset({"postgres", "redis", "s3", "moto"})
 SERVER_PARAMETERS = frozenset({"postgresql", "redis", "s3", "moto", "bucket"})
 TESTS = Path(__file__).parent
 # The kinds with the longest files first: a long file that starts last runs alone.
@@ -60,9 +63,18 @@ OPTIONAL: tuple[tuple[str, list[str], str], ...] = (
     (BROWSER, ["browser"], "in a browser: make test-browser runs them"),
     (IMAGES, ["deploy/images"], "of the images: make test-images runs them"),
     (
+        LAB,
+        [
+            "e2e/test_notebooks.py",
+            "lab/e2e",
+            "lab/integration/training/test_training_improves_recall.py",
+        ],
+        "of the lab from end to end: make test-lab runs them",
+    ),
+    (
         CHAOS,
-        ["faults/test_chaos.py", "faults/test_rolling.py"],
-        "of a deployment under faults: make test-chaos runs them",
+        ["faults/test_chaos.py", "faults/test_milvus.py", "faults/test_rolling.py"],
+        "of a deployment or a Milvus under faults: make test-chaos runs them",
     ),
 )
 LEFT_OUT = [option for option in OPTIONAL if not os.environ.get(option[0])]
@@ -74,7 +86,18 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """`auto` is one more than there are cores, because some test always waits; `logical` is one
     for each core."""
     waiting = config.getoption("numprocesses") == "auto"
+    config.option.testrunuid = str(os.getpid())  # by which the workers find the fork server
+    config.stash[FORKED_WORKERS] = sys.platform == "linux"
     return (os.cpu_count() or 1) + int(waiting)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes(config: pytest.Config, specs: list[execnet.XSpec]) -> None:
+    """Fork the workers of `auto` and `logical` from the process that has imported everything:
+    each would need 13 CPU seconds for it."""
+    if config.stash.get(FORKED_WORKERS, False):
+        for spec in specs:
+            spec.python = forked_command(TESTS / "support" / "forked_worker.py")
 
 
 @pytest.hookimpl(wrapper=True)
@@ -176,13 +199,6 @@ def redis() -> Iterator[RedisServer]:
 def s3() -> Iterator[S3Server]:
     """A real S3 server, as above."""
     with start_s3() as server:
-        yield server
-
-
-@pytest.fixture(scope="session")
-def milvus_server() -> Iterator[MilvusServer]:
-    """A real Milvus, from the wheel."""
-    with start_milvus() as server:
         yield server
 
 

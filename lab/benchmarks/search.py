@@ -1,12 +1,11 @@
 """Search latency against exact rivals; every result is compared with brute force in float64.
 
-    placewise bench search [--photos 2000] [--dimensions 512,7168,98304] [--growth]
+    placewise bench search [--photos 2000] [--dimensions 512,7168,98304]
 
 A generated map of VLAD-like descriptors (`synthetic_map`) is searched by Placewise, NumPy, faiss
 and by loading every chunk. Columns: best, p50 and p95 of a query; p50 divided by that of Placewise;
 queries with a wrong result. The largest map is also searched with its rows dropped from the page
-cache (`cold`), and `--growth` scans the codes of up to a million photos. Every query is run with
-all methods in turn, so that other load affects all of them.
+cache (`cold`). Every query is run with all methods in turn, so that other load affects all of them.
 """
 
 from __future__ import annotations
@@ -20,9 +19,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 from uuid import UUID
@@ -43,12 +40,8 @@ from lab.benchmarks.synthetic_map import (
 )
 from services.cli.output import JsonOption, Table
 from services.search.executor import execute_query
-from services.search.sign_code_search import SignCodeBlocks, SignCodedQuery, scan_first_level
 from services.search.snapshot import Snapshot
 from services.search.worker import SearchWorker
-from shared.codes.jit import REORDERED_FASTMATH, numba_jit
-from shared.codes.rotation import get_rotation
-from shared.codes.sign_codes import level_ends
 from shared.storage.chunks import CODED_DIMENSION, Row, Rows
 from tests.support.memory import memory_bytes
 
@@ -99,9 +92,6 @@ def bench(
         Any, integers_option("Descriptor dimensions, multiples of 64, comma-separated.")
     ] = "512,7168,98304",
     queries: Annotated[int, typer.Option(min=2, help="Queries of each kind.")] = 20,
-    growth: Annotated[
-        bool, typer.Option("--growth", help="Also scan the sign codes of up to a million photos.")
-    ] = False,
     folder: Annotated[
         Path | None,
         typer.Option(
@@ -131,8 +121,6 @@ def bench(
                         compare_methods(report, world, city, queries, progress)
                         if (count, dimension) == (max(photos), max(dimensions)):
                             measure_cold_cache(report, world, city, queries, progress)
-        if growth:
-            measure_growth(report, progress)
 
 
 DECIMALS = 12  # scores equal to this precision are ties, which are ordered by photo id
@@ -424,87 +412,3 @@ def _cached_pages(memory: mmap.mmap) -> NDArray[np.bool_]:
     if libc.mincore(address, ctypes.c_size_t(len(memory)), found.ctypes.data_as(ctypes.c_void_p)):
         raise OSError(ctypes.get_errno(), "mincore")
     return (found & 1).astype(bool)
-
-
-GROWTH_DIMENSION = 98_304
-GROWTH_SIZES = (100_000, 1_000_000)
-GROWTH_ROUNDS = 15
-TARGET_RATIO = 1.3
-
-Words = NDArray[np.uint64]
-
-
-@numba_jit(REORDERED_FASTMATH)
-def _xor_words(words: Words) -> np.uint64:
-    """XOR all words, in four interleaved streams, which read faster than one."""
-    quarter = words.shape[0] // 4
-    a, b, c = words[:quarter], words[quarter : 2 * quarter], words[2 * quarter : 3 * quarter]
-    d = words[3 * quarter :]
-    total = np.uint64(0)
-    for i in range(quarter):
-        total ^= a[i] ^ b[i] ^ c[i] ^ d[i]
-    return total
-
-
-def measure_growth(report: Report, progress: Progress, sizes: Sequence[int] = GROWTH_SIZES) -> None:
-    """Report the latency of scans of random codes, and its ratio to reading them from memory.
-
-    They are read with one thread and with one per core, between the scans, so that other load
-    affects both; the faster counts.
-    """
-    task = progress.add_task("growth", total=len(sizes) * GROWTH_ROUNDS)
-    cores = len(os.sched_getaffinity(0))
-    for rows in sizes:
-        codes, scan = _make_scan(rows)
-        words = codes.ravel()
-        parts = np.array_split(words, cores)
-        _xor_words(words[:8])  # compiles
-        seconds = np.empty((GROWTH_ROUNDS, 3))
-        with ThreadPoolExecutor(cores, thread_name_prefix="read") as pool:
-            works: list[Callable[[], object]] = [
-                scan,
-                partial(_xor_words, words),
-                partial(_read_together, pool, parts),
-            ]
-            for of_round in seconds:
-                for number, work in enumerate(works):
-                    started_at = time.perf_counter()
-                    work()
-                    of_round[number] = time.perf_counter() - started_at
-                progress.advance(task)
-        report.add_latency(f"growth: scan of {rows:,} codes", seconds[:, 0].tolist())
-        scanning, alone, together = np.median(seconds, axis=0).tolist()
-        ratio = scanning / min(alone, together)
-        report.add(f"growth: {rows:,} codes, time / reading", ratio, "x", at_most=TARGET_RATIO)
-
-
-def _read_together(pool: ThreadPoolExecutor, parts: Sequence[Words]) -> None:
-    list(pool.map(_xor_words, parts))
-
-
-def _make_scan(rows: int) -> tuple[Words, Callable[[], object]]:
-    """Return (rows, words) random first-level codes and a compiled scan of them for one query."""
-    rotation = get_rotation(GROWTH_DIMENSION)
-    words = int(level_ends(rotation.padded)[0])
-    rng = np.random.default_rng(SEED)
-    query = SignCodedQuery.of(rng.standard_normal(GROWTH_DIMENSION).astype(np.float32), rotation)
-    codes = np.frombuffer(rng.bytes(8 * rows * words), np.uint64).reshape(rows, words)
-    begins = np.arange(0, rows, CHUNK_ROWS)
-    addresses = (codes.ctypes.data + begins * codes.strides[0]).astype(np.uint64)
-    blocks = SignCodeBlocks(
-        dimension=GROWTH_DIMENSION,
-        first_rows=np.array([*begins, rows], np.int64),
-        level_addresses=addresses[np.newaxis],
-        row_addresses=np.empty(0, np.uint64),
-        number_bytes=np.empty(0, np.int64),
-        norms=np.ones(rows, np.float32),
-        zero_rows=np.empty(0, np.int64),
-        keep_alive=codes,
-    )
-    mask = np.ones(rows, bool)
-
-    def scan() -> object:
-        return scan_first_level(blocks, [query], [mask])
-
-    scan()  # compiles
-    return codes, scan

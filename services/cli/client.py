@@ -40,7 +40,8 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
         RunningServer(server) if server else find_running_server(settings.placewise_home)
     )
     if running_server is not None:
-        with Client(running_server.url, map_name, key or running_server.key) as client:
+        key = key or running_server.key
+        with Client(running_server.url, key=key, map=map_name, patience_seconds=0) as client:
             yield client
         return
     if settings.search_worker_urls:
@@ -73,7 +74,8 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
                         f"{START_TIMEOUT_SECONDS:.0f} s. Check the log messages above.",
                     )
                 time.sleep(0.01)
-            with Client(running.url, map_name, running.local_key) as client:
+            key = running.local_key
+            with Client(running.url, key=key, map=map_name, patience_seconds=0) as client:
                 yield client
         except Exception as error:
             if running.error is not None:  # why the server has stopped

@@ -15,6 +15,7 @@ from rich.table import Column
 
 from placewise.answers import Evaluation
 from placewise.client import Client
+from placewise.protocol import drop_none
 from services.cli.client import connect, wait_for_job
 from services.cli.environment import lab_missing
 from services.cli.output import (
@@ -69,8 +70,7 @@ def evaluate_map(
     as_json: bool,
 ) -> None:
     """Evaluate a map with its own photos (leave-one-out) and its labelled queries."""
-    options = {"sample": sample, "seed": seed}
-    parameters = {name: value for name, value in options.items() if value is not None}
+    parameters = drop_none(sample=sample, seed=seed)
     with connect(server, map_name, key) as client, progress_bar() as progress:
         job = wait_for_job(client, client.evaluate(**parameters), progress, "evaluating")
         requested = (e for e in client.evaluations() if not e.automatic)

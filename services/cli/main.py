@@ -89,15 +89,20 @@ def list_commands(root: Path = ROOT) -> Commands:
 COMMANDS = list_commands()
 
 
-class _PlacewiseGroup(TyperGroup):
+class _ListingGroup(TyperGroup):
+    """Lists its commands by panel, each with the whole first paragraph of its help."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        commands: list[Any] = [self.get_command(ctx, name) for name in self.list_commands(ctx)]
+        for panel in dict.fromkeys(command.rich_help_panel for command in commands):
+            with formatter.section(panel or "Commands"):
+                listed = [command for command in commands if command.rich_help_panel == panel]
+                texts = [(each.name, each.help.partition("\n\n")[0]) for each in listed]
+                formatter.write_dl([(name, " ".join(text.split())) for name, text in texts])
+
+
+class _PlacewiseGroup(_ListingGroup):
     """Reports the error of a command in one line, as JSON with `--json`, and exits with code 1."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        if not args or "--help" in args:
-            from services.cli.help_layout import prepare_help  # only the help needs it
-
-            prepare_help(self)
-        return super().parse_args(ctx, args)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         name = _use_hyphens(args[0])
@@ -125,7 +130,8 @@ def build_app(names: Collection[str] | None = None, commands: Commands = COMMAND
         panel, module, attribute = commands[name]
         command = getattr(importlib.import_module(module), attribute)
         if isinstance(command, typer.Typer):
-            app.add_typer(command, name=name, rich_help_panel=panel)
+            group = command.info.cls or _ListingGroup
+            app.add_typer(command, name=name, cls=group, rich_help_panel=panel)
         else:
             app.command(name, rich_help_panel=panel, **getattr(command, "command_settings", {}))(
                 command
@@ -174,6 +180,7 @@ def _new_app() -> typer.Typer:
         cls=_PlacewiseGroup,
         help="Self-hosted visual place recognition: find where a photo was taken.",
         no_args_is_help=True,
+        rich_markup_mode=None,
         context_settings={"token_normalize_func": _use_hyphens},
         pretty_exceptions_enable=False,
         add_completion=False,

@@ -339,6 +339,12 @@ def stage_bars(progress: Progress, prefix: str = "") -> Callable[[str, int, int]
     return report
 
 
+def print_problem(mark: str, name: str, reason: str) -> None:
+    """Print to stderr, with a mark such as `skipped`, what is wrong with a photo or a file."""
+    line = f"{escape(printable_text(name))}: {escape(reason)}"
+    err_console.print(f"[red]{mark}[/red] {line}", soft_wrap=True)
+
+
 def print_failures(report: dict[str, Any], *outcomes: str) -> None:
     """Print the items of a report's lists `outcomes`: `path`, `reason`, `filename` if any."""
     for outcome in outcomes:
@@ -346,11 +352,7 @@ def print_failures(report: dict[str, Any], *outcomes: str) -> None:
             err_console.print(f"{len(report[outcome])} {outcome}:")
         for item in report[outcome]:
             name = f" ({item['filename']})" if "filename" in item else ""
-            err_console.print(
-                f"[red]{outcome}[/red] {escape(printable_text(item['path'] + name))}: "
-                f"{escape(item['reason'])}",
-                soft_wrap=True,
-            )
+            print_problem(outcome, item["path"] + name, item["reason"])
 
 
 @contextlib.contextmanager

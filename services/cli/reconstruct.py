@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 from uuid import UUID
@@ -15,8 +14,6 @@ from rich.table import Column
 from placewise.answers import Component, Reconstruction
 from placewise.client import Client
 from services.cli.client import connect, wait_for_job
-from services.cli.ingest.geotags import find_photos
-from services.cli.ingest.upload import upload_photos
 from services.cli.output import (
     Json,
     JsonOption,
@@ -26,7 +23,6 @@ from services.cli.output import (
     Table,
     first_names,
     format_percent,
-    print_failures,
     print_json,
     print_message,
     print_note,
@@ -48,16 +44,7 @@ def reconstruct(
             exists=True,
             file_okay=False,
             help="Folder of a COLMAP model (cameras and images, .bin or .txt), such as hloc's, "
-            "whose poses are used.",
-        ),
-    ] = None,
-    images: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            exists=True,
-            file_okay=False,
-            help="With --import: upload the photos of this folder first.",
+            "whose poses are used. Its images have to be in the map: placewise index.",
         ),
     ] = None,
     origin: Annotated[
@@ -85,23 +72,18 @@ def reconstruct(
     Photos that show the same are reconstructed together and aligned to their coordinates. A later
     run adds the photos that are new. Interrupted, it goes on from its last step.
     """
-    if ((images or origin) and not model) or (model and from_scratch):
+    if (origin and not model) or (model and from_scratch):
         raise InvalidRequest(
             "options_contradict",
-            "--images and --origin go with --import; --from-scratch goes with no other option.",
+            "--origin goes with --import; --from-scratch goes with neither.",
         )
     place = None if origin is None else _parse_origin(origin)
-    poses = read_colmap_model(model) if model else None  # fails before anything is uploaded
+    poses = read_colmap_model(model) if model else None
     if poses is not None and place is not None:
         poses = poses.model_copy(update={"origin": place})
     if model and (model / "images.bin").exists() and (model / "images.txt").exists():
         print_note(f"{model} has text files, too. As COLMAP does, the binary files are read.")
-    with ExitStack() as stack:
-        client = stack.enter_context(connect(server, map_name, key))
-        progress = stack.enter_context(progress_bar())
-        if images is not None:
-            photos = find_photos(images, None, None, places_by_folder=False)
-            print_failures(upload_photos(client, photos, progress), "refused", "failed")
+    with connect(server, map_name, key) as client, progress_bar() as progress:
         job = wait_for_job(client, _start(client, poses, from_scratch), progress, "reconstructing")
         made = client.reconstruction()
     if as_json:

@@ -11,7 +11,7 @@ from fastapi.routing import APIRoute
 
 from services.gateway import metrics
 from services.gateway.admission import AdmissionControl
-from services.gateway.authentication import READ, AuthenticationMiddleware, check_declared_scopes
+from services.gateway.authentication import READ, AuthenticationMiddleware
 from services.gateway.dependencies import ALL_MAPS, API_PREFIX, GatewayContext
 from services.gateway.idempotency import IdempotentReplay, replay_response
 from services.gateway.metrics import GatewayMetrics
@@ -112,7 +112,6 @@ def create_app(gateway: GatewayContext) -> FastAPI:
     app.add_middleware(
         BodySizeLimitMiddleware,
         form_paths=form_paths(),
-        exempt_paths={f"{API_PREFIX}{batches.BATCH_UPLOAD_PATH}"},
         limits={
             f"{API_PREFIX}{places.PROPOSALS_PATH}": positions.MAX_BODY_BYTES,
             f"{API_PREFIX}{positions.POSITIONS_PATH}": positions.MAX_BODY_BYTES,
@@ -152,7 +151,6 @@ def _create_router() -> APIRouter:
     """
     router = APIRouter(responses=PROBLEM_RESPONSES)
     for module in RESOURCES:
-        check_declared_scopes(module.router)
         router.include_router(module.router, prefix=API_PREFIX, responses=AUTHENTICATION_RESPONSES)
     router.include_router(health.probe_router)
     router.include_router(

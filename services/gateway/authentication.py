@@ -20,9 +20,7 @@ from typing import Annotated, Protocol
 from urllib.parse import urlsplit
 from uuid import UUID
 
-from fastapi import APIRouter, Request, Security
-from fastapi.params import Security as SecurityParameter
-from fastapi.routing import APIRoute
+from fastapi import Request, Security
 from fastapi.security import HTTPBearer, SecurityScopes
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.concurrency import run_in_threadpool
@@ -296,24 +294,3 @@ async def _require_scope(
 READ = Security(_require_scope, scopes=[KeyScope.READ.value])
 WRITE = Security(_require_scope, scopes=[KeyScope.WRITE.value])
 ADMIN = Security(_require_scope, scopes=[KeyScope.ADMIN.value])
-
-
-def check_declared_scopes(router: APIRouter) -> None:
-    """Check that every route declares exactly one scope.
-
-    Raises:
-        AssertionError: A route declares none or several.
-    """
-    for route in router.routes:
-        if not isinstance(route, APIRoute):
-            continue
-        declared = [
-            dependency
-            for dependency in route.dependencies
-            if isinstance(dependency, SecurityParameter)
-        ]
-        if len(declared) != 1:
-            raise AssertionError(
-                f"{route.path} declares {len(declared)} scopes: give it exactly one, "
-                "dependencies=[READ], [WRITE] or [ADMIN]"
-            )

@@ -121,16 +121,13 @@ class IdempotentRequest:
 
     def replay_if_executed(self) -> None:
         """Raise as `begin` does, if another process has executed the request meanwhile."""
-        if self._fingerprint is None:
-            return
-        with self._gateway.catalog.read() as session:
-            if (stored := self._find_response(session)) is not None:
-                raise IdempotentReplay(stored.status, stored.headers, stored.body)
-
-    def _find_response(self, session: Session) -> StoredResponse | None:
         if self.key is None or self._fingerprint is None:
-            return None
-        return find_response(session, _key_scope(self._request), self.key, self._fingerprint)
+            return
+        scope = _key_scope(self._request)
+        with self._gateway.catalog.read() as session:
+            stored = find_response(session, scope, self.key, self._fingerprint)
+        if stored is not None:
+            raise IdempotentReplay(stored.status, stored.headers, stored.body)
 
     def store_response(
         self, session: Session, status: int, body: BaseModel, headers: dict[str, str] | None = None
@@ -168,17 +165,6 @@ class IdempotentRequest:
         accepted = self.store_job_response(session, job)
         self._response.headers.update(accepted.headers)
         return accepted
-
-    def replace_response(
-        self, status: int, body: BaseModel, headers: dict[str, str] | None = None
-    ) -> None:
-        """Replace the stored response in a transaction of its own."""
-        if self._fingerprint is None:
-            return
-        with self._gateway.catalog.write() as session:
-            if (stored := self._find_response(session)) is not None:
-                stored.status, stored.headers = status, headers or {}
-                stored.body = body.model_dump_json()
 
 
 @contextlib.contextmanager

@@ -1,26 +1,18 @@
-"""ASGI middleware: security headers, the body size limit and the handler of unexpected exceptions.
-
-`SecurityHeadersMiddleware` sets headers on every response, errors included, unless the route has
-set them itself, as the web page on `/` and the API documentation do. `BodySizeLimitMiddleware`
-limits bodies that are read into memory (JSON); forms and manifests are limited by the streaming
-parsers of their routes. `ExceptionHandlerMiddleware` must be inside the middleware that adds
-headers: Starlette's own handler of unexpected exceptions is outside of all middleware, so its
-responses would lack them.
-"""
+"""ASGI middleware: security headers, the size limit of bodies, and unexpected exceptions."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Container, Mapping
+from collections.abc import Mapping
 
 from fastapi import Request
-from starlette.datastructures import MutableHeaders
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from services.gateway.dependencies import API_PREFIX
 from shared.config.settings import Settings
 from shared.errors import TooLarge
-from shared.http.problem_details import handle_unexpected_error, problem_response
+from shared.http.problem_details import handle_unexpected_error
 
 SECURITY_HEADERS = {
     # API responses are not pages: when a browser displays one, it must not run or load anything.
@@ -36,7 +28,10 @@ PRIVATE_CACHE_CONTROL = "private, no-store"
 
 
 class SecurityHeadersMiddleware:
-    """Adds the security headers, and `Cache-Control` below `/api`, that a response does not set."""
+    """Adds the security headers, and `Cache-Control` below `/api`, that a response does not set.
+
+    Responses of the web page and of the API documentation set their own.
+    """
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         self._app = app
@@ -69,7 +64,7 @@ VALUE_MARKS = (b",", b"[", b"{")
 
 
 class BodySizeLimitMiddleware:
-    """Responds 413 to large bodies without reading the rest.
+    """Refuses large bodies that are read into memory (JSON) without reading the rest.
 
     `body_too_large` for more than MAX_JSON_BYTES, `too_many_values` for more values in them than
     bodies of that size need.
@@ -77,7 +72,6 @@ class BodySizeLimitMiddleware:
     Args:
         form_paths: Matches the paths of the routes that limit multipart bodies themselves. Any
             other route would read such a body into memory.
-        exempt_paths: Paths of the routes that limit all their bodies themselves.
         limits: Other limits than MAX_JSON_BYTES, by path.
     """
 
@@ -86,12 +80,10 @@ class BodySizeLimitMiddleware:
         app: ASGIApp,
         *,
         form_paths: re.Pattern[str],
-        exempt_paths: Container[str],
         limits: Mapping[str, int],
     ) -> None:
         self._app = app
         self._form_paths = form_paths
-        self._exempt_paths = exempt_paths
         self._limits = limits
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -101,54 +93,40 @@ class BodySizeLimitMiddleware:
         limit = self._limits.get(scope["path"], MAX_JSON_BYTES)
         max_values = limit // BYTES_PER_VALUE
         size = values = 0
-        error: TooLarge | None = None
 
         async def counted_receive() -> Message:
-            nonlocal size, values, error
+            nonlocal size, values
             message = await receive()
             body = message.get("body", b"")
             size += len(body)
             values += sum(map(body.count, VALUE_MARKS))
             if size > limit:
-                error = TooLarge("body_too_large", f"The body is larger than {limit} bytes.")
-            elif values > max_values:
-                error = TooLarge(
-                    "too_many_values",
-                    f"The body has more than {max_values} values. Split it, or send less.",
-                )
+                raise TooLarge("body_too_large", f"The body is larger than {limit} bytes.")
+            if values > max_values:
                 while message.get("more_body") and size <= limit:
                     # Many clients read no response before they have sent their body.
                     message = await receive()
                     size += len(message.get("body", b""))
-            # The route sees a client disconnect; its response is replaced by the 413.
-            return message if error is None else {"type": "http.disconnect"}
+                raise TooLarge(
+                    "too_many_values",
+                    f"The body has more than {max_values} values. Split it, or send less.",
+                )
+            return message
 
-        async def guarded_send(message: Message) -> None:
-            if error is None:
-                await send(message)
-            elif message["type"] == "http.response.start":
-                await problem_response(error, Request(scope))(scope, receive, send)
-
-        await self._app(scope, counted_receive, guarded_send)
+        await self._app(scope, counted_receive, send)
 
     def _is_exempt(self, scope: Scope) -> bool:
-        path = scope["path"]
-        if path in self._exempt_paths:
-            return True
-        return _is_multipart(scope) and self._form_paths.fullmatch(path) is not None
-
-
-def _is_multipart(scope: Scope) -> bool:
-    return any(
-        name == b"content-type" and value.lower().startswith(b"multipart/")
-        for name, value in scope["headers"]
-    )
+        media_type = Headers(scope=scope).get("content-type", "")
+        is_form = media_type.lower().startswith("multipart/")
+        return is_form and self._form_paths.fullmatch(scope["path"]) is not None
 
 
 class ExceptionHandlerMiddleware:
     """Converts unhandled exceptions into an opaque 500 with the request id.
 
-    If the response has already started, the exception is raised again and closes the connection.
+    It is inside the middleware that adds headers: Starlette's own handler is outside of all
+    middleware, so that its responses would lack them. If the response has already started, the
+    exception is raised again and closes the connection.
     """
 
     def __init__(self, app: ASGIApp) -> None:

@@ -27,8 +27,6 @@ log = logging.getLogger(__name__)
 RETRY_AFTER_SECONDS = 2  # default of a 503 without `retry_after_seconds`
 REQUEST_ID_SCOPE_KEY = "placewise.request_id"
 """ASGI scope key of the request id, in services that assign one."""
-CLOSED_STATUS_SCOPE_KEY = "placewise.closed_with"
-"""ASGI scope key of the status that the server sent itself before it closed the connection."""
 MAX_REPORTED_ERRORS = 20  # of invalid fields
 MAX_FIELD_CHARACTERS = 200
 CLIENT_GONE = 499
@@ -95,7 +93,7 @@ def problem_response(error: PlacewiseError, request: Request) -> JSONResponse:
         retry_after = RETRY_AFTER_SECONDS
     if retry_after is not None:
         headers["Retry-After"] = str(math.ceil(retry_after))
-    if error.status == 413:
+    if error.status in (408, 413):
         headers["Connection"] = "close"  # the rest of the body is not read
     return JSONResponse(
         {**error.as_problem(), "instance": request.url.path},
@@ -137,6 +135,8 @@ async def _handle_validation_error(request: Request, error: Exception) -> JSONRe
 async def _handle_http_exception(request: Request, error: Exception) -> JSONResponse:
     """Handle Starlette's exceptions, for example of unknown paths and methods."""
     assert isinstance(error, HTTPException)
+    if isinstance(error.__cause__, PlacewiseError):  # raised while FastAPI read the body
+        return problem_response(error.__cause__, request)
     code = HTTP_CODES.get(error.status_code, "http_error")
     return JSONResponse(
         {

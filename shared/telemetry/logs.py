@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any
 
@@ -82,8 +81,6 @@ class _JsonFormatter(logging.Formatter):
         line |= _extra(record)
         if record.exc_info:
             line["error"] = self.formatException(record.exc_info)
-        elif record.exc_text:  # of a record of another process
-            line["error"] = record.exc_text
         text = json.dumps(line, ensure_ascii=False, default=str)
         return UNSAFE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
@@ -140,24 +137,3 @@ def configure_logging(settings: Settings, service: str, *, for_operators: bool =
         logging.getLogger(name).setLevel(logging.DEBUG if settings.debug else logging.INFO)
     for name in QUIET_LOGGERS:
         logging.getLogger(name).setLevel(logging.WARNING)
-
-
-class _ForwardingHandler(logging.Handler):
-    def __init__(self, send: Callable[[logging.LogRecord], None]) -> None:
-        super().__init__()
-        self._send = send
-
-    def emit(self, record: logging.LogRecord) -> None:
-        record.msg, record.args = record.getMessage(), None
-        if record.exc_info:
-            record.exc_text = logging.Formatter().formatException(record.exc_info)
-            record.exc_info = None
-        self._send(record)
-
-
-def forward_logs(settings: Settings, send: Callable[[logging.LogRecord], None]) -> None:
-    """Pass the records of this process to `send`, picklable, and log nothing here."""
-    configure_logging(settings, "embedded")
-    handler = _ForwardingHandler(send)
-    handler.addFilter(_ContextFilter("embedded"))
-    logging.getLogger().handlers[:] = [handler]

@@ -45,23 +45,6 @@ def test_a_running_server_is_backed_up_and_another_one_answers_as_it_did(
         assert run(home, "storage", "verify", "--originals")["faults"] == []
 
 
-def test_a_damaged_chunk_of_a_running_server_is_found_and_described_again(
-    server: ServerProcess,
-) -> None:
-    chunk = next((server.home / "objects/chunks").rglob("*.npy"))
-    damaged = chunk.with_suffix(".other")
-    damaged.write_bytes(chunk.read_bytes()[:-1] + b"x")
-    damaged.rename(chunk)  # the server may have mapped the file that was there
-    found = run(server.home, "storage", "verify", code=1)
-    assert [fault["wrong"] for fault in found["faults"]] == ["damaged"]
-    mended = run(server.home, "storage", "verify", "--repair", code=1)
-    assert mended["queued_photos"] >= 1
-    for job in server.client.get("/api/v1/jobs").json()["jobs"]:
-        if job["kind"] == "index":
-            server.finished(job["job_id"])
-    assert run(server.home, "storage", "verify")["faults"] == []
-
-
 def test_one_scrape_of_the_embedded_server_has_metrics_of_all_its_parts(
     server: ServerProcess,
 ) -> None:

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from placewise.client import Client
@@ -60,23 +59,6 @@ def test_the_client_sends_files_with_a_manifest_and_names_of_objects(
     assert failed.error["code"] == "object_not_found"
     with pytest.raises(InvalidRequest, match="not below imports/"):
         client.import_objects([{"key": "originals/a.jpg"}])
-
-
-def test_the_client_gives_places_and_restores_a_deleted_photo(
-    client: Client, tmp_path: Path
-) -> None:
-    (tmp_path / "somewhere.jpg").write_bytes(photo_bytes(130))
-    uploaded = client.upload(tmp_path / "somewhere.jpg")
-    client.wait(uploaded)
-    id_ = uploaded.file_id
-    assert id_ in {each.photo.image_id for each in client.propose_places()}
-    place = {"file_id": str(id_), "latitude": 45.5, "longitude": 7.5}
-    assert client.give_places([place]).given == [id_]
-    assert client.photo(id_).latitude == 45.5
-    assert client.undo_places([id_]).restored == [id_]
-    client.delete_photo(id_)
-    assert id_ in {each.image_id for each in client.photos(removed=True)}
-    assert client.restore_photo(id_).latitude is None
 
 
 def index(server: ServerProcess, path: Path, *options: str, code: int = 0) -> dict[str, Any]:
@@ -137,29 +119,3 @@ def test_index_brings_in_a_list_of_keys(server: ServerProcess, tmp_path: Path) -
     assert index(server, listed)["uploaded"] == 1
     refused = index(server, listed, "--update", code=1)
     assert refused["code"] == "unsupported_option"
-
-
-def test_export_writes_what_other_programs_read(server: ServerProcess, tmp_path: Path) -> None:
-    uploaded = server.client.post(
-        "/api/v1/upload", files={"file": ("195.jpg", photo_bytes(195))}, data={"place": "export"}
-    ).json()
-    server.finished(uploaded["job_id"])
-
-    def export(*arguments: str) -> dict[str, Any]:
-        run = CommandLine(tmp_path, server.home)("export", *arguments, "--json")
-        written: dict[str, Any] = run.json()
-        return written
-
-    rows = export("descriptors", "--out", str(tmp_path / "rows"))
-    mapped = np.load(tmp_path / "rows" / "descriptors.npy", mmap_mode="r")
-    assert mapped.shape == (rows["rows"], rows["dimension"])
-    names = (tmp_path / "rows" / "names.txt").read_text().splitlines()
-    assert len(names) == len(mapped)
-    assert "195.jpg" in names
-    export("geojson", "--out", str(tmp_path / "map.geojson"))
-    features = json.loads((tmp_path / "map.geojson").read_text())["features"]
-    assert {"export"} <= {one["properties"]["place"] for one in features}
-    pairs = export("pairs", "--out", str(tmp_path / "pairs.txt"), "--top-k", "1", "--names", "id")
-    lines = (tmp_path / "pairs.txt").read_text().splitlines()
-    assert len(lines) == pairs["pairs"] > 0
-    assert all(len(set(line.split())) == 2 for line in lines)

@@ -32,7 +32,7 @@ class Walk:
     def __init__(self, immich: ImmichServer, server: ServerProcess, folder: Path) -> None:
         self.immich, self.home, self.folder = immich, server.home, folder
         self.map = folder.name.replace("_", "-")[:40]
-        self.client = Client(str(server.client.base_url), self.map, *server_key(server))
+        self.client = Client(str(server.client.base_url), map=self.map, key=server_key(server))
         self.client.create_map(self.map)
         self.located = {
             number: immich.add(
@@ -70,9 +70,9 @@ class Walk:
         return [self.immich.position(each) for each in self.unlocated.values()]
 
 
-def server_key(server: ServerProcess) -> list[str]:
+def server_key(server: ServerProcess) -> str | None:
     authorization = server.client.headers.get("Authorization")
-    return [authorization.removeprefix("Bearer ")] if authorization else []
+    return authorization.removeprefix("Bearer ") if authorization else None
 
 
 @pytest.fixture

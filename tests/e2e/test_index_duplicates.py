@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from tests.support.photos import exif_with_position, photo_bytes
+from tests.support.photos import photo_bytes
 from tests.support.server import CommandLine, ServerProcess
 
 
@@ -52,18 +52,3 @@ def test_a_corrected_table_is_refused_by_name_and_taken_with_update(
 def test_a_blank_where_an_address_had_a_plus_is_read_as_plus(server: ServerProcess) -> None:
     expected = "/api/v1/search?captured_after=2026-05-01T12:00:00+02:00"
     assert server.client.get(expected).status_code == 200
-
-
-def test_a_photo_that_was_geotagged_since_is_updated_and_not_doubled(
-    server: ServerProcess, tmp_path: Path
-) -> None:
-    folder_of(tmp_path, photo_bytes(710), photo_bytes(711))
-    assert index(server, tmp_path)["without_coordinates"] == 2
-    geotagged = photo_bytes(710, exif=exif_with_position(45.75, 7.25))
-    (tmp_path / "photos" / "0.jpg").write_bytes(geotagged)
-    for updated in (1, 0):
-        report = index(server, tmp_path)
-        assert (report["already_there"], report["updated"], report["refused"]) == (2, updated, [])
-    [photo] = server.client.get("/api/v1/search", params={"near": "45.75,7.25,1"}).json()["images"]
-    file = server.client.get(f"/api/v1/uploads/{photo['image_id']}/image")
-    assert file.content == geotagged

@@ -14,7 +14,6 @@ import httpx2
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 from tests.support.server import ServerProcess, environment, run_command
-from tests.support.waiting import wait_until
 
 # One photo per batch, so that of several photos only the first ones are under way.
 SETTINGS = {"batch_photos": 1}
@@ -185,17 +184,6 @@ def test_a_cancelled_job_runs_only_after_a_retry(server: ServerProcess) -> None:
     body = problem(post(server, uploaded["job_id"], "retry"), 409, "job_not_retryable")
     assert body["job_id"] == uploaded["job_id"]
     assert server.similar(uploaded["file_id"]).status_code == 200
-
-
-def test_a_running_job_is_cancelled_and_its_result_discarded(server: ServerProcess) -> None:
-    with server.no_decoding():
-        uploaded = server.upload(photo_bytes(next(fresh))).json()
-        wait_until(lambda: get(server, uploaded["status_url"])["state"] == "running")
-        assert post(server, uploaded["job_id"], "cancel").json()["state"] == "cancelled"
-    last = server.upload(photo_bytes(next(fresh))).json()["job_id"]
-    assert server.finished(last)["state"] == "succeeded"
-    assert get(server, uploaded["status_url"])["state"] == "cancelled"
-    assert not get(server, f"/api/v1/uploads/{uploaded['file_id']}")["searchable"]
 
 
 def test_a_cancelled_query_has_no_result(server: ServerProcess) -> None:

@@ -8,7 +8,6 @@ import threading
 import time
 from dataclasses import dataclass
 from typing import Any
-from uuid import uuid4
 
 import httpx2
 import numpy as np
@@ -16,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.support.photos import photo_bytes
-from tests.support.problems import field_refused, problem
+from tests.support.problems import problem
 from tests.support.server import ServerProcess
 from tests.support.waiting import wait_until
 
@@ -178,45 +177,6 @@ def test_answers_say_whose_vocabulary_they_were_made_with(
     stats = got(server.client.get("/api/v1/database/stats"))
     assert (stats["vocabulary"], stats["feature_dimension"]) == ("provisional", 4 * WIDTH)
     assert vocabulary(server, own["vocabulary_id"])["provenance"]["seed"] == 7
-
-
-@pytest.mark.usefixtures("fitted")
-def test_one_model_change_at_a_time(server: ServerProcess, before: Before) -> None:
-    answering = active(server)["generation_id"]
-    stored = {path.name for path in (server.home / "objects" / "vocabularies").iterdir()}
-    known = active(server)["vocabulary_id"]
-    with server.no_decoding():
-        running = started(server.client.post(VOCABULARIES, json={}))
-        for answer in (
-            server.client.post(VOCABULARIES, json={}),
-            server.client.post(GENERATIONS, json={"vocabulary_id": known}),
-            post_import(server, npy(centres(3))),
-        ):
-            body = problem(answer, 409, "model_change_running")
-            assert body["job_id"] == running
-            assert f"/api/v1/jobs/{running}/cancel" in body["detail"]
-        assert got(server.similar(before.photos[0]))["generation_id"] == answering
-        cancelled = server.client.post(f"/api/v1/jobs/{running}/cancel")
-        assert got(cancelled)["state"] == "cancelled"
-    left = {path.name for path in (server.home / "objects" / "vocabularies").iterdir()}
-    assert left == stored, "the rejected vocabulary is not stored"
-    problem(server.client.post(f"/api/v1/jobs/{running}/retry"), 409, "job_not_retryable")
-    assert active(server)["generation_id"] == answering
-    assert got(server.similar(before.photos[0]))["generation_id"] == answering
-    done(server, post_import(server, npy(centres(4))))  # the way is free again
-
-
-@pytest.mark.usefixtures("fitted")
-def test_bad_requests_for_a_model_change_are_refused(server: ServerProcess) -> None:
-    post = server.client.post
-    field_refused(post(VOCABULARIES, json={"clusters": 0}), "clusters")
-    field_refused(post(VOCABULARIES, json={"k": 64}), "k")
-    field_refused(post(GENERATIONS, json={"vocabulary_id": "the old one"}), "vocabulary_id")
-    unknown = post(GENERATIONS, json={"vocabulary_id": str(uuid4())})
-    problem(unknown, 404, "vocabulary_not_found")
-    problem(post(f"{VOCABULARIES}/import"), 400, "no_file")
-    problem(post_import(server, b""), 400, "empty_file")
-    problem(post(f"{VOCABULARIES}/import", content=npy(centres(1))), 400, "no_file")
 
 
 @pytest.mark.usefixtures("fitted")

@@ -74,18 +74,6 @@ def test_unknown_paths_and_methods_are_problems_too(server: ServerProcess) -> No
     problem(server.client.delete("/livez"), 405, "method_not_allowed")
 
 
-def test_a_body_that_is_no_json_is_a_problem(server: ServerProcess) -> None:
-    photo = server.upload(photo_bytes(0)).json()["file_id"]
-    headers = {"Content-Type": "application/json"}
-    for call, path in (
-        ("PATCH", f"{API}/uploads/{photo}"),
-        ("POST", f"{API}/vocabularies"),
-        ("POST", f"{API}/generations"),
-    ):
-        answer = server.client.request(call, path, content=b'{"a": ', headers=headers)
-        problem(answer, 400, "malformed_body")
-
-
 # --- starts that are refused -----------------------------------------------------------------
 
 

@@ -65,8 +65,7 @@ def test_exported_model_is_one_that_can_be_imported(walk: ServerProcess) -> None
     assert {photo.name for photo in model.photos} == {f"{n}.jpg" for n in range(SCENE.photos)}
     refused = run(walk, "reconstruct", "--import", out, fails=True)
     assert "bad_colmap_model" in refused
-    photos = walk.home.parent / "photos"
-    made = result(walk, "reconstruct", "--import", out / "0", "--images", photos)
+    made = result(walk, "reconstruct", "--import", out / "0")
     assert made["imported"]
     assert (made["result"]["reconstructed"], made["result"]["unmatched"]) == (SCENE.photos, 0)
     (stray,) = made["result"]["left_out_photos"]
@@ -83,7 +82,6 @@ def test_exported_model_is_one_that_can_be_imported(walk: ServerProcess) -> None
 @pytest.mark.parametrize(
     "options",
     [
-        ("--images", "photos"),
         ("--origin", "45,7,240"),
         ("--from-scratch", "--import", "photos"),
     ],

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from placewise.client import Client
 from shared.storage.s3 import Bucket, S3Store
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess, environment, run_command
@@ -80,18 +79,3 @@ def test_placewise_does_not_start_without_its_object_store(tmp_path: Path) -> No
     assert errors, ended.stderr
     assert nobody.endpoint in errors[0]
     assert "Traceback" not in ended.stderr
-
-
-def test_a_photo_sent_straight_to_the_bucket_is_found(
-    server: ServerProcess, bucket: Bucket, tmp_path: Path
-) -> None:
-    photo = tmp_path / "straight.jpg"
-    photo.write_bytes(photo_bytes(20))
-    with Client(str(server.client.base_url)) as client:
-        stored = client.upload_direct(photo, latitude=45.5, longitude=7.5, tags=["direct"])
-        client.wait(stored)
-        found = client.photo(stored.file_id)
-    assert (found.original_filename, found.tags) == ("straight.jpg", ["direct"])
-    best = server.ask(photo_bytes(20)).json()["similar_images"][0]
-    assert best["image_id"] == str(found.image_id)
-    assert keys(bucket, "incoming/") == set()

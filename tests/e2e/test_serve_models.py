@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from tests.support.checkpoints import own_output, untrained, write_checkpoint
+from tests.support.checkpoints import write_checkpoint
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
 from tests.support.server import CommandLine, ServerProcess
@@ -63,25 +62,3 @@ def test_a_trained_model_describes_a_map_answers_and_makes_room_again(
     assert server.ask(near_copy(2)).json()["similar_images"][0]["original_filename"] == "2.jpg"
     assert placewise.json("models", "remove", "walks")["removed_model"] == "walks"
     assert placewise.json("models", "added") == []
-
-
-def test_describe_makes_of_a_file_and_of_an_added_model_what_the_model_itself_makes(
-    placewise: Commands, tmp_path: Path
-) -> None:
-    checkpoint = write_checkpoint(tmp_path / "best.ckpt")
-    placewise.json("models", "add", checkpoint, "--name", "described")
-    photo = tmp_path / "street.jpg"
-    photo.write_bytes(photo_bytes(7))
-    specs = []
-    for name in (f"gsv:{checkpoint}", "gsv:described"):
-        out = tmp_path / "rows.npy"
-        specs.append(placewise.json("describe", photo, "--extractor", name, "--out", out)["spec"])
-        (row,) = np.load(out)
-        assert np.allclose(row, own_output(untrained(), photo_bytes(7)), atol=1e-5)
-        assert specs[-1].pop("extractor") == name
-        assert specs[-1].pop("backbone") == name
-    assert specs[0] == specs[1]
-    out = tmp_path / "none.npy"
-    expected = ("describe", photo, "--extractor", "gsv:nobody", "--out", out)
-    assert "model_missing" in placewise.refused(*expected)
-    assert not out.exists()

@@ -76,12 +76,3 @@ def test_an_entry_that_is_not_allowed_by_its_exact_name_is_refused(
     answer = server.client.post(MAPS, json=params)
     field_refused(answer, "extractor")
     assert "CODE_ALLOWED" in answer.json()["detail"]
-
-
-def test_an_entry_that_is_no_extractor_keeps_photos_waiting_with_the_reason(
-    server: ServerProcess, folder: Path
-) -> None:
-    make(server, "unfit", f"torchhub:{folder}:maps")
-    response = server.ask(photo_bytes(1), map="unfit")
-    assert response.json()["code"] == "torchhub_unusable", response.text
-    assert "input.size" in response.json()["detail"]

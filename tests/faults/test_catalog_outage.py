@@ -65,13 +65,6 @@ class Deployment:
             url, PoolConfig(size=4, overflow=4, wait_seconds=1.0, connect_seconds=2.0)
         )
         migrate(self.catalog)
-        with self.catalog.engine.begin() as connection:
-            # The tests' servers keep commits in their own memory for a moment; one that is killed
-            # would lose what it has acknowledged.
-            connection.exec_driver_sql(
-                f'ALTER DATABASE "{self.catalog.url.database}" SET synchronous_commit = on'
-            )
-        self.catalog.close()  # connections that are opened from here on have it
         with self.catalog.write() as session:
             get_or_create_default_map(session, settings.new_map_extractor)
         store, wakeups = FolderStore(folder / "objects"), InProcessWakeups()

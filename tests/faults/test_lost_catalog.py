@@ -1,14 +1,13 @@
-"""The catalog removed, another one, an older one: no start; many orphans: none is collected.
+"""The catalog removed, or another one: no start; many orphans: none is collected.
 
-Orphans of any age may be collected here (ORPHAN_AGE_SECONDS=0), and each start of a server collects
-at once.
+tests/contract/storage has the same of a bucket, and of an older catalog. Orphans of any age may be
+collected here (ORPHAN_AGE_SECONDS=0), and each start of a server collects at once.
 """
 
 from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -18,94 +17,68 @@ import pytest
 
 from shared.config.settings import Settings
 from shared.storage import OwnedStore
-from shared.storage.keys import JOURNAL, ORIGINALS, TRASH, key_before_trash, new_original_key
+from shared.storage.keys import ORIGINALS, new_original_key
 from shared.storage.open_store import open_store
 from tests.support.metrics import read
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess, environment, run_command
-from tests.support.servers import S3Server
 from tests.support.waiting import wait_until
 
 ORPHANS = 101  # more than are collected without asking
-EARLY, LATE = 2, 3  # photos before and after the catalog was copied
+PHOTOS = 3
 SETTINGS = {"orphan_age_seconds": 0, "auto_evaluate_photos": 0}
 
 
 @dataclass
 class Filled:
-    """A home whose server has ended, and a copy of its catalog from before the last photos."""
+    """A home whose server has ended."""
 
     home: Path
-    older_catalog: Path
-    settings: dict[str, Any]
-
-    def copy(self, target: Path) -> Filled:
-        """The same, for a test that changes it. A bucket stays the same one."""
-        shutil.copytree(self.home, target)
-        return Filled(target, self.older_catalog, self.settings)
 
     @property
     def store(self) -> OwnedStore:
-        return open_store(Settings(placewise_home=self.home, **self.settings), exclusive=False)
+        return open_store(Settings(placewise_home=self.home), exclusive=False)
 
     def originals(self) -> set[str]:
         return {info.key for info in self.store.list(ORIGINALS)}
-
-    def stored_photos(self) -> set[str]:
-        """The keys of all objects but notes and the journal; of the trash, those from before."""
-        keys = {i.key for i in self.store.list("") if not i.key.startswith((JOURNAL, "."))}
-        return {key_before_trash(key) if key.startswith(TRASH) else key for key in keys}
 
     def remove_catalog(self) -> None:
         for file in self.home.glob("catalog.sqlite*"):
             file.unlink()
 
     def server(self, **more: Any) -> ServerProcess:
-        return ServerProcess(self.home, **self.settings, **more)
+        return ServerProcess(self.home, **more)
 
     def command(self, *arguments: str, **more: Any) -> CompletedProcess[str]:
-        env = environment(self.home, **SETTINGS, **self.settings, **more)
+        env = environment(self.home, **SETTINGS, **more)
         return run_command(*arguments, env=env, cwd=self.home.parent)
 
     def check_refused(self, *arguments: str, **more: Any) -> None:
         done = self.command(*arguments, **more)
         assert done.returncode == 1, done.stderr
-        assert "folder_taken" in done.stderr or "bucket_taken" in done.stderr
+        assert "folder_taken" in done.stderr
         assert "placewise storage rebuild" in done.stderr
 
 
-@pytest.fixture(scope="module", params=["folder", "bucket"])
-def filled_once(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Filled:
-    folder = tmp_path_factory.mktemp(request.param)
-    variables: dict[str, Any] = {}
-    if request.param == "bucket":
-        server: S3Server = request.getfixturevalue("s3")
-        variables = server.variables(server.new_bucket().name)
-    filled = Filled(folder / "home", folder / "older.sqlite", variables)
+@pytest.fixture(scope="module")
+def filled_once(tmp_path_factory: pytest.TempPathFactory) -> Filled:
+    filled = Filled(tmp_path_factory.mktemp("filled") / "home")
     with filled.server() as running:
-        _fill(running, range(EARLY))
+        for number in range(PHOTOS):
+            photo = {"file": ("photo.jpg", photo_bytes(number))}
+            assert running.client.post("/api/v1/upload", files=photo).status_code == 202
+        wait_until(lambda: _searchable(running) == PHOTOS)
         assert running.stop() == 0
-        shutil.copy(filled.home / "catalog.sqlite", filled.older_catalog)
-        running.start()
-        _fill(running, range(EARLY, EARLY + LATE))
-        assert running.stop() == 0
-    assert len(filled.originals()) == EARLY + LATE
+    assert len(filled.originals()) == PHOTOS
     return filled
 
 
 @pytest.fixture
-def filled(filled_once: Filled, tmp_path: Path) -> Iterator[Filled]:
-    """A copy of the home. Of a bucket nothing may be missing at the end of a test."""
-    before = filled_once.stored_photos()
-    yield filled_once.copy(tmp_path / "copied")
-    assert filled_once.stored_photos() == before
-
-
-def _fill(running: ServerProcess, numbers: range) -> None:
-    for number in numbers:
-        photo = {"file": ("photo.jpg", photo_bytes(number))}
-        assert running.client.post("/api/v1/upload", files=photo).status_code == 202
-    wait_until(lambda: _searchable(running) == numbers.stop)
+def filled(filled_once: Filled, tmp_path: Path) -> Filled:
+    """A copy, for a test that changes it."""
+    home = tmp_path / "copied"
+    shutil.copytree(filled_once.home, home)
+    return Filled(home)
 
 
 def _searchable(running: ServerProcess) -> int:
@@ -134,18 +107,6 @@ def test_wrong_catalog_stops_every_start_and_no_object_is_touched(
             redis_url="redis://127.0.0.1:1/0",
             **({} if command == ("serve",) else {"search_urls": "http://127.0.0.1:1"}),
         )
-    assert {info.key for info in filled.store.list("")} == before
-
-
-def test_older_catalog_stops_every_start_and_no_object_is_touched(filled: Filled) -> None:
-    before = {info.key for info in filled.store.list("")}
-    filled.remove_catalog()
-    shutil.copy(filled.older_catalog, filled.home / "catalog.sqlite")
-    for command in (("serve",), ("storage", "verify")):
-        done = filled.command(*command)
-        assert done.returncode == 1
-        assert "catalog_behind" in done.stderr
-        assert "placewise storage rebuild" in done.stderr
     assert {info.key for info in filled.store.list("")} == before
 
 
@@ -180,5 +141,3 @@ def test_many_orphans_are_held_until_their_collection_is_confirmed(filled: Fille
         back = run("storage", "restore-trash")
         assert back == {"restored": ORPHANS, "kept_in_trash": 0}
     assert filled.originals() == originals | orphans
-    for key in orphans:
-        filled.store.delete(key)

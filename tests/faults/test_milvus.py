@@ -1,4 +1,4 @@
-"""Answers while Milvus is killed, emptied and paused: none is wrong without a word."""
+"""A real Milvus: it answers as milvus-lite does, and while it is killed, emptied and paused."""
 
 from __future__ import annotations
 
@@ -19,10 +19,14 @@ from shared.config.settings import Settings
 from shared.errors import Unavailable
 from shared.search_api.protocol import SearchRequest, SearchResponse
 from shared.storage import FolderStore
+from tests.contract.search import test_milvus as lite
+from tests.contract.search.test_milvus import collections, on_milvus, port, worker
+from tests.contract.search.test_search_backend import whatever_the_catalog
 from tests.support.servers import MilvusServer, start_milvus
 from tests.support.small_map import SmallMap, assert_answers, unit_rows
 from tests.support.waiting import wait_until
 
+__all__ = ["on_milvus", "port", "worker"]
 pytestmark = pytest.mark.databases("postgresql")
 BACK_SECONDS = 120.0  # for a server that was started again to have loaded its collections
 VECTOR = unit_rows(1000, 1)[0]
@@ -33,6 +37,25 @@ def server() -> Iterator[MilvusServer]:
     """One of its own, to be killed."""
     with start_milvus() as started:
         yield started
+
+
+@pytest.fixture
+def milvus_uri(server: MilvusServer) -> str:
+    return server.url
+
+
+@whatever_the_catalog
+class TestSearchOnAMilvusServer(lite.MilvusContract):
+    """The same promises of a server."""
+
+    @pytest.fixture(autouse=True)
+    def _no_collections(self, worker: MilvusWorker) -> Iterator[None]:
+        yield
+        for name in collections(worker):
+            worker.client.drop_collection(name)
+
+    test_expressions = staticmethod(lite.test_expression_selects_the_photos_that_match_the_filter)
+    test_levels = staticmethod(lite.test_levels_of_place_labels_have_no_wildcards)
 
 
 class Load:
@@ -103,10 +126,10 @@ class Load:
     def wait_until_whole(self) -> None:
         """Until both workers answer with everything again."""
         deadline = time.monotonic() + BACK_SECONDS
-        for worker in self.workers:
+        for asked in self.workers:
             while True:
                 with contextlib.suppress(Unavailable):
-                    answer = worker.search(self.places.request(self.reference, k=100))
+                    answer = asked.search(self.places.request(self.reference, k=100))
                     if not answer.missing:
                         assert_answers(answer, self.places.brute_force(VECTOR, 100))
                         break

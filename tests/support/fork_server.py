@@ -8,6 +8,7 @@ one request at a time and has no threads, as a fork would copy the locks that th
 from __future__ import annotations
 
 import atexit
+import gc
 import importlib
 import json
 import os
@@ -24,6 +25,7 @@ from sqlalchemy.orm import configure_mappers
 
 import services.cli
 from services.cli import collection_paused
+from services.search.sign_code_search import compile_kernels
 from shared.config.settings import Settings
 from tools.make_api_page import openapi_description
 
@@ -55,6 +57,10 @@ MODULES = (
     "uvicorn.lifespan.on",
     "uvicorn.loops.auto",
     "uvicorn.protocols.http.h11_impl",
+    # What tests import.
+    "hypothesis",
+    "pycolmap",
+    "schemathesis",
 )
 REQUEST_BYTES = 128 * 1024  # an environment has a few KiB
 
@@ -98,6 +104,8 @@ def _answer(client: socket.socket, codes: dict[int, int | None]) -> dict[str, An
         if codes[pid] is None:
             codes[pid] = _exit_code(pid)
         answer = codes[pid]
+    elif "command" not in request:
+        answer = None  # it is ready
     else:
         answer = os.fork()
         for standard, descriptor in enumerate(given):
@@ -161,10 +169,12 @@ def _import() -> None:
     Settings()
     configure_mappers()
     openapi_description()  # works out all routes
+    compile_kernels()
 
 
 def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the tests, which then end this
+    atexit.register(gc.unfreeze)  # or triton would hide an error behind hundreds of "leaks"
     listener = socket.socket(fileno=int(sys.argv[1]))
     with collection_paused():  # which leaves these pages shared with the children's collections
         _import()

@@ -107,12 +107,19 @@ def forked_program(path: Path, prefix: str = "") -> Path:
 
     `prefix` is a shell command that runs first.
     """
-    _fork_server()
-    client = Path(__file__).with_name("forked_placewise.py")
-    words = [sys.executable, "-IS", str(client), ADDRESS[1:], PLACEWISE]
-    path.write_text(f'#!/bin/sh\n{prefix}\nexec {shlex.join(words)} "$@"\n')
+    path.write_text(f'#!/bin/sh\n{prefix}\nexec {forked_command(PLACEWISE)} "$@"\n')
     path.chmod(0o755)
     return path
+
+
+def forked_command(program: str | Path) -> str:
+    """A shell command that runs this program in Python as a fork.
+
+    AssertionError with what the fork server has printed if it could not start.
+    """
+    _fork_server().ask({})
+    client = Path(__file__).with_name("forked_program.py")
+    return shlex.join([sys.executable, "-IS", str(client), ADDRESS[1:], str(program)])
 
 
 class ForkedProcess:

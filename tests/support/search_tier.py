@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import uvicorn
 
@@ -97,13 +96,8 @@ class SearchTier:
         self.port.__enter__()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.port.__exit__(kind, error, trace)
+    def __exit__(self, *raised: Any) -> None:
+        self.port.__exit__(*raised)
         for server in self.servers:
             server.ask_to_stop()
         for server in self.servers:

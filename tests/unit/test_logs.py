@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
-import pickle
 from collections.abc import Callable, Iterator
 
 import pytest
 
 from shared.config.settings import Settings
-from shared.telemetry.logs import configure_logging, forward_logs
+from shared.telemetry.logs import configure_logging
 from shared.telemetry.request_ids import request_id_context, request_id_or_new
 
 Set = Callable[..., None]
@@ -133,23 +132,3 @@ def test_an_invalid_request_id_is_replaced(sent: str | None) -> None:
     assert made != sent
     assert len(made) == 36
     assert request_id_or_new("my-id:1/2") == "my-id:1/2"
-
-
-@pytest.mark.parametrize("log_format", ["json", "text"])
-def test_records_of_the_extractors_process_are_logged_by_the_server_with_their_traceback(
-    set_up: Set, capsys: pytest.CaptureFixture[str], log_format: str
-) -> None:
-    sent: list[bytes] = []
-    forward_logs(Settings(), lambda record: sent.append(pickle.dumps(record)))
-    with request_id_context("r-1"):
-        try:
-            raise ValueError("why")
-        except ValueError:
-            logging.getLogger("services").exception("photo %d failed", 7, extra={"jobs": [1]})
-    assert capsys.readouterr().err == ""
-    set_up(LOG_FORMAT=log_format)
-    record: logging.LogRecord = pickle.loads(sent.pop())
-    logging.getLogger(record.name).handle(record)
-    text = capsys.readouterr().err
-    for expected in ("photo 7 failed", "r-1", "jobs", "ValueError: why"):
-        assert expected in text

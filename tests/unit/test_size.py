@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
-from tools import size
 from tools.size import Bound, find_violations, lower_limits, measure, read_bounds
 
 PAGE = """# Architecture
@@ -64,27 +61,3 @@ def test_python_files_are_counted_by_room(tmp_path: Path) -> None:
     assert (figures["files of the service"], figures["lines of the service"]) == (1, 3)
     assert (figures["files of the tests"], figures["lines of the tests"]) == (1, 3)
     assert figures["migrations"] == 0
-
-
-@pytest.mark.parametrize(("limit", "code"), [("100,000", None), ("1", 1)])
-def test_a_rise_above_the_limit_is_exit_code_1_and_the_output_is_tab_separated(
-    limit: str,
-    code: int | None,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    page = tmp_path / "page.md"
-    monkeypatch.setattr(size, "PAGE", page)
-    monkeypatch.setattr(size, "find_late_raises", lambda root: [])
-    monkeypatch.setattr(size, "measure", lambda root: {"lines of the lab": 24_000})
-    page.write_text(f"# A\n\n## Size\n\n| lines of the lab | {limit} | 900 |\n")
-    ended: int | str | None = None
-    try:
-        size.main([])
-    except SystemExit as error:
-        ended = error.code
-    assert ended == code
-    printed = capsys.readouterr()
-    assert printed.out == f"figure\tnow\tlimit\taim\nlines of the lab\t24,000\t{limit}\t900\n"
-    assert ("above the limit" in printed.err) == (code == 1)

@@ -1,4 +1,4 @@
-"""Times in @UTM@ file names."""
+"""Places and times in @UTM@ file names."""
 
 from __future__ import annotations
 
@@ -6,6 +6,54 @@ import pytest
 
 from shared.errors import InvalidRequest
 from shared.utm_filenames import upload_fields_of_file_name
+
+EAST, NORTH = "0396877.76", "4991561.25"
+NO_FIELDS = "@" * 13
+
+
+def test_degrees_of_a_name_go_before_its_metres() -> None:
+    name = f"@{EAST}@{NORTH}@32@T@45.0691@7.6931@pano@tile@370.5@@@@@@.jpg"
+    expected = {"latitude": "45.0691", "longitude": "7.6931", "heading": "10.5"}
+    assert upload_fields_of_file_name(name, None) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "zone"),
+    [
+        (f"@{EAST}@{NORTH}@32@T@@@@@@@@@@@.jpg", None),
+        (f"@{EAST}@{NORTH}@32@T@@@@@@@@@@@.jpg", "33T"),
+        (f"@{EAST}@{NORTH}@.jpg", "32T"),
+        (f"@{EAST}@{NORTH}{NO_FIELDS}.jpg", "32t"),
+    ],
+)
+def test_metres_lie_in_the_zone_of_the_name_or_else_in_the_given_one(
+    name: str, zone: str | None
+) -> None:
+    fields = upload_fields_of_file_name(name, zone)
+    assert float(fields["latitude"]) == pytest.approx(45.07, abs=1e-3)
+    assert float(fields["longitude"]) == pytest.approx(7.69, abs=1e-3)
+    assert "heading" not in fields
+
+
+@pytest.mark.parametrize(
+    ("name", "code", "named"),
+    [
+        (f"@{EAST}@{NORTH}{NO_FIELDS}.jpg", "no_utm_zone", "--utm-zone"),
+        (f"@east@{NORTH}@32@T@.jpg", "bad_coordinates", "@east@"),
+        (f"@{EAST}@{NORTH}@99@T@.jpg", "bad_coordinates", "@99@T@"),
+        (f"@{EAST}@{NORTH}@32@I@.jpg", "bad_coordinates", "@32@I@"),
+    ],
+)
+def test_a_name_without_a_place_on_earth_is_refused(name: str, code: str, named: str) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        upload_fields_of_file_name(name, None)
+    assert caught.value.code == code
+    assert named in caught.value.detail
+
+
+@pytest.mark.parametrize("name", ["photo.jpg", "me@home.jpg", "a@1@2@3@4@.jpg", "@me.jpg"])
+def test_ordinary_names_say_nothing(name: str) -> None:
+    assert upload_fields_of_file_name(name, "32T") == {}
 
 
 def stamped(timestamp: str) -> str:

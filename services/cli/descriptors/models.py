@@ -14,6 +14,7 @@ import typer
 from rich.markup import escape
 from rich.table import Column
 
+from placewise.protocol import printable_name
 from services.cli.client import connect, wait_for_job
 from services.cli.descriptors.local_weights import inspect_weights, list_extractor_configs
 from services.cli.environment import read_settings
@@ -80,15 +81,15 @@ def add(
     """
     with connect(server, map_name, key) as client, progress_bar() as progress:
         client.models()  # fails before the upload if the URL or key is wrong
-        sending = progress.add_task("uploading (bytes)", total=checkpoint.stat().st_size)
-        started = client.add_model(
-            checkpoint,
-            name,
-            options=options,
-            licence=licence,
-            note=note,
-            on_sent=lambda sent_bytes: progress.update(sending, completed=sent_bytes),
-        )
+        with progress.open(checkpoint, "rb", description="uploading (bytes)") as file:
+            started = client.add_model(
+                file,
+                name,
+                options=options,
+                licence=licence,
+                note=note,
+                filename=printable_name(checkpoint),
+            )
         job = wait_for_job(client, started, progress, "checking")
     model = job.result or {}
     print_result(

@@ -11,6 +11,7 @@ import typer
 from rich.table import Column
 
 from placewise.answers import Generation, Job
+from placewise.protocol import drop_none
 from services.cli.client import active_generation, connect, wait_for_job
 from services.cli.output import (
     Json,
@@ -53,8 +54,7 @@ def fit(
     as_json: JsonOption = False,
 ) -> None:
     """Fit a vocabulary on the map's photos, reindex them, and switch to the result."""
-    options = {"clusters": clusters, "sample": sample, "seed": seed}
-    parameters = {name: value for name, value in options.items() if value is not None}
+    parameters = drop_none(clusters=clusters, sample=sample, seed=seed)
     with connect(server, map_name, key) as client, progress_bar() as progress:
         job = wait_for_job(client, client.fit_vocabulary(**parameters), progress, "vocabulary")
     _print_generation(job, as_json)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -11,20 +12,36 @@ from pathlib import Path
 from typing import BinaryIO
 
 from filelock import FileLock, Timeout
+from pydantic import BaseModel, ValidationError
 
 from services.cli.immich.api import Coordinates, ImmichApi
 from services.cli.locate.folder import set_clocks
 from services.cli.locate.library import LibraryPhoto, LocatedPhoto, UndoReport, WriteReport
-from services.cli.locate.undo_journal import append_to_journal, read_journal, repair_journal
-from services.cli.output import Json
+from services.cli.output import Json, printable_path
 from shared.config.private_files import make_private_folder
-from shared.errors import Conflict, NotFound, PlacewiseError, TooManyRequests, Unavailable
+from shared.errors import (
+    Conflict,
+    NotFound,
+    PlacewiseError,
+    TooManyRequests,
+    Unavailable,
+    Unprocessable,
+)
 from shared.imaging.capture_place import is_null_island
 
 NOWHERE: Coordinates = (0.0, 0.0)
 """In place of coordinates that can't be taken away: no place, also when Immich reads metadata"""
 SAME_DEGREES = 1e-6
 """Immich stores coordinates in a sidecar, too, where they are rounded"""
+
+
+class _Change(BaseModel):
+    """A line of the journal: the coordinates of an image before and after a write."""
+
+    id: str
+    name: str
+    before: Coordinates | None
+    after: Coordinates
 
 
 class ImmichLibrary:
@@ -87,7 +104,7 @@ class ImmichLibrary:
                 continue
             position = (each.proposal.latitude, each.proposal.longitude)
             same_position.setdefault(position, []).append(each.photo)
-        with self._open_journal():
+        with self._lock_journal():
             for position, photos in same_position.items():
                 names = {}
                 for photo in photos:
@@ -98,8 +115,10 @@ class ImmichLibrary:
                         report.skipped[photo.name] = "got coordinates meanwhile"
                     else:
                         names[photo.id] = photo.name
-                        line = {"id": photo.id, "name": photo.name, "before": former}
-                        append_to_journal(self._journal, {**line, "after": position})
+                        change = _Change(
+                            id=photo.id, name=photo.name, before=former, after=position
+                        )
+                        self._append_to_journal(change)
                 try:
                     if names:
                         self._api.set_coordinates(list(names), position)
@@ -116,36 +135,55 @@ class ImmichLibrary:
         report = UndoReport()
         if not self._journal.exists():
             raise NotFound("nothing_to_undo", "Nothing was written into this library.")
-        with self._open_journal() as lines:
-            changes: dict[str, list[Json]] = {}
-            for line in lines:
-                changes.setdefault(line["id"], []).append(line)
+        with self._lock_journal():
+            changes: dict[str, list[_Change]] = {}
+            for line in self._read_journal():
+                changes.setdefault(line.id, []).append(line)
             for asset_id, (first, *later) in changes.items():
                 asset = self._api.asset(asset_id)
                 present = asset and _place(_coordinates(asset))
                 if not present:
                     continue  # deleted, or without a place, as it was
-                if not any(_is_same(present, line["after"]) for line in (first, *later)):
-                    report.changed_since.append(first["name"])
+                if not any(_is_same(present, line.after) for line in (first, *later)):
+                    report.changed_since.append(first.name)
                     continue
-                self._api.set_coordinates([asset_id], first["before"] or NOWHERE)
-                (report.restored if first["before"] else report.removed).append(first["name"])
+                self._api.set_coordinates([asset_id], first.before or NOWHERE)
+                (report.restored if first.before else report.removed).append(first.name)
             if not report.changed_since:
                 self._journal.unlink()
         return report
 
     @contextlib.contextmanager
-    def _open_journal(self) -> Iterator[list[Json]]:
+    def _lock_journal(self) -> Iterator[None]:
+        """Hold the journal, without an incomplete last line, which a killed process has left."""
         make_private_folder(self._journal.parent)
         try:
             with FileLock(self._journal.with_suffix(".lock"), timeout=0):
-                lines = read_journal(self._journal, _check_line)
-                repair_journal(self._journal, lines)
-                yield lines
+                if self._journal.exists():
+                    complete = self._journal.read_bytes().rfind(b"\n") + 1
+                    os.truncate(self._journal, complete)
+                yield
         except Timeout as error:
             raise Conflict(
                 "locate_in_progress", "Another `placewise immich` writes to this library."
             ) from error
+
+    def _read_journal(self) -> Iterator[_Change]:
+        for number, line in enumerate(self._journal.read_bytes().splitlines(), start=1):
+            try:
+                yield _Change.model_validate_json(line)
+            except ValidationError as error:
+                raise Unprocessable(
+                    "journal_damaged",
+                    f"{printable_path(self._journal)}: line {number} can't be read.",
+                ) from error
+
+    def _append_to_journal(self, change: _Change) -> None:
+        """Append a line, which is on the disk when the call returns."""
+        with self._journal.open("ab") as file:
+            file.write(change.model_dump_json().encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
 
 
 def _library_photo(image: Json, album: str) -> LibraryPhoto:
@@ -191,10 +229,3 @@ def _place(coordinates: Coordinates | None) -> Coordinates | None:
 
 def _is_same(one: Coordinates, other: Coordinates) -> bool:
     return all(abs(a - b) <= SAME_DEGREES for a, b in zip(one, other, strict=True))
-
-
-def _check_line(line: Json) -> None:
-    for latitude, longitude in (line["before"] or NOWHERE, line["after"]):
-        _ = float(latitude), float(longitude)
-    if not isinstance(line["id"], str) or not isinstance(line["name"], str):
-        raise TypeError

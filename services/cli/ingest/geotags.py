@@ -6,7 +6,6 @@ The server reads EXIF and XMP itself and uses them for every field that is not g
 from __future__ import annotations
 
 import contextlib
-import glob
 import re
 import tempfile
 import unicodedata
@@ -63,19 +62,8 @@ class LocalPhoto:
 
 
 def find_local_sources(sources: Sequence[str]) -> list[Path] | None:
-    """Expand patterns, and return the folders, photos and archives; None if a source is none.
-
-    Raises:
-        InvalidRequest: `no_photos` if a pattern matches nothing.
-    """
-    paths: list[Path] = []
-    for source in sources:
-        found = [Path(source)]
-        if not found[0].exists() and glob.has_magic(source):
-            found = sorted(map(Path, glob.glob(source, recursive=True)))  # noqa: PTH207 absolute, too
-            if not found:
-                raise InvalidRequest("no_photos", f"No file matches the pattern {source}.")
-        paths += found
+    """Return the folders, photos and archives; None if a source is none."""
+    paths = list(map(Path, sources))
     return paths if all(p.is_dir() or _is_photo(p) or is_archive(p) for p in paths) else None
 
 

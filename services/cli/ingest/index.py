@@ -59,9 +59,8 @@ def index(
         list[str],
         typer.Argument(
             metavar="SOURCE",
-            help="Folders (searched recursively), photos, patterns such as 'trip/*.jpg', and "
-            "archives (zip, tar, tar.gz); or one JSONL manifest with one photo per line; or one "
-            "prefix of the server's own bucket.",
+            help="Folders (searched recursively), photos and archives (zip, tar, tar.gz); or one "
+            "JSONL manifest with one photo per line; or one prefix of the server's own bucket.",
         ),
     ],
     table: Annotated[
@@ -153,7 +152,7 @@ def index(
             raise InvalidRequest(
                 "several_sources",
                 f"{source} and {len(sources) - 1} more: index manifests and bucket prefixes one at "
-                "a time. Only existing folders, photos, archives and patterns can be combined.",
+                "a time. Only existing folders, photos and archives can be combined.",
             )
         elif source.startswith("s3://"):
             _reject_options("a bucket prefix", local_file_options)

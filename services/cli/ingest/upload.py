@@ -188,9 +188,6 @@ def _upload_concurrently(
 def _patch_fields(fields: dict[str, str]) -> Json:
     """Convert the text fields of an upload form to the JSON fields of a PATCH."""
     typed: Json = dict(fields)
-    for name in ("latitude", "longitude", "altitude", "heading"):
-        if name in typed:
-            typed[name] = float(typed[name])
     if "tags" in typed:
         typed["tags"] = typed["tags"].split(",")
     if "metadata" in typed:

@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from services.cli.client import connect
+from services.cli.locate.folder import FolderLibrary
 from services.cli.locate.proposals import LocateOptions, locate_library, report_undo
-from services.cli.locate.writers import FolderLibrary
 from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption, TimeZoneOption
 from shared.config.command_line import command_line
 from shared.tracks.motion import MOTION_MODELS

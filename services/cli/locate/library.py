@@ -80,8 +80,8 @@ class UndoReport:
 class PhotoLibrary(Protocol):
     """Where photos are and where accepted proposals go.
 
-    Everything that `write` writes is in a journal before it is written, so that `undo` works after
-    the process was killed. Neither changes a photo that something else has changed meanwhile.
+    What `write` has written can be undone, also after the process was killed. Neither changes a
+    photo that something else has changed meanwhile.
     """
 
     @property
@@ -99,17 +99,11 @@ class PhotoLibrary(Protocol):
         """
 
     def write(self, located: Sequence[LocatedPhoto]) -> WriteReport:
-        """Write the positions of photos that still have none.
-
-        Raises:
-            Conflict: `locate_in_progress` while another process writes to the library.
-        """
+        """Write the positions of photos that still have none."""
 
     def undo(self) -> UndoReport:
         """Restore what all calls of `write` have changed.
 
         Raises:
             NotFound: `nothing_to_undo`.
-            Conflict: `locate_in_progress`.
-            Unprocessable: `journal_damaged`; nothing is changed then.
         """

@@ -34,12 +34,12 @@ from services.cli.locate.preview import (
 from services.cli.output import (
     Json,
     Table,
-    err_console,
     first_names,
     format_percent,
     print_json,
     print_message,
     print_note,
+    print_problem,
     print_table,
     printable_text,
     progress_bar,
@@ -265,8 +265,7 @@ def _print_proposals(
     with_coordinates = sum(photo.latitude is not None for photo in photos)
     for photo in photos:
         if photo.gps_error:
-            line = f"{printable_text(photo.name)}: {photo.gps_error}"
-            err_console.print(f"[red]left as it is[/red] {escape(line)}", soft_wrap=True)
+            print_problem("left as it is", photo.name, photo.gps_error)
     if not located:
         print_message(
             f"{with_coordinates} of {len(photos)} photos have coordinates: there is nothing to "
@@ -295,8 +294,7 @@ def _print_proposals(
         f"Undo: {options.undo_command}"
     )
     for name, reason in written.skipped.items():
-        line = f"[red]skipped[/red] {escape(printable_text(name))}: {escape(reason)}"
-        err_console.print(line, soft_wrap=True)
+        print_problem("skipped", name, reason)
 
 
 def report_undo(report: UndoReport, message: str, as_json: bool) -> None:
@@ -306,9 +304,6 @@ def report_undo(report: UndoReport, message: str, as_json: bool) -> None:
     else:
         print_note(message)
         for name in report.changed_since:
-            err_console.print(
-                f"[red]changed since[/red] {escape(printable_text(name))}: left as it is",
-                soft_wrap=True,
-            )
+            print_problem("changed since", name, "left as it is")
     if report.changed_since:
         raise typer.Exit(1)

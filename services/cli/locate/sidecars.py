@@ -3,27 +3,37 @@
 Coordinates are properties of the EXIF schema with degrees and
 decimal minutes, such as `exif:GPSLatitude="48,51.500000N"`. They go into an `rdf:Description` of
 their own before the end of `rdf:RDF`; all other bytes stay as they are, which no XML library of
-Python does when it writes a document again.
+Python does when it writes a document again. So the sidecar of before is what is left without that
+element, and undoing needs no journal.
 """
 
 from __future__ import annotations
 
+import os
+import re
+import shutil
 from pathlib import Path
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
-from shared.errors import Unprocessable
+from services.cli.output import atomic_write, printable_path
+from shared.errors import Conflict, Unprocessable
 from shared.imaging.xmp import EXIF, RDF, read_xmp
 
 METHOD = "estimated by Placewise"
 TRUE_NORTH = "T"  # GPSImgDirectionRef: not the magnetic one
-EMPTY_SIDECAR = f"""<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
-<x:xmpmeta xmlns:x="adobe:ns:meta/">
+NEW_SIDECAR = f"""<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
+<x:xmpmeta xmlns:x="adobe:ns:meta/" x:xmptk="Placewise">
  <rdf:RDF xmlns:rdf="{RDF}">
  </rdf:RDF>
 </x:xmpmeta>
 <?xpacket end="w"?>
 """.encode()
+NAMESPACES = f'\n    xmlns:rdf="{RDF}"\n    xmlns:exif="{EXIF}"'
+ADDED_ELEMENT = re.compile(
+    rf"""<rdf:Description rdf:about=("[^"]*"|'[^']*'){NAMESPACES}"""
+    r"""(\n    exif:\w+="[^"]*")+/>\n """.encode()
+)
 
 
 def sidecar_path(photo: Path) -> Path:
@@ -49,7 +59,7 @@ def add_position(
     Raises:
         Unprocessable: `bad_sidecar` if it can't be edited, `has_coordinates` if it has some.
     """
-    data = existing or EMPTY_SIDECAR
+    data = existing or NEW_SIDECAR
     try:
         there = read_xmp(data)
         offset, about = _end_of_rdf(data)
@@ -73,11 +83,66 @@ def add_position(
     added = "".join(
         f'\n    exif:{name}="{value}"' for name, value in properties.items() if name not in there
     )
-    element = (
-        f"<rdf:Description rdf:about={quoteattr(about)}\n"
-        f'    xmlns:rdf="{RDF}"\n    xmlns:exif="{EXIF}"{added}/>\n '
-    )
+    element = f"<rdf:Description rdf:about={quoteattr(about)}{NAMESPACES}{added}/>\n "
     return data[:offset] + element.encode() + data[offset:]
+
+
+def has_estimate(sidecar: bytes) -> bool:
+    """Return whether `add_position` has added to a sidecar, however that was edited since."""
+    return ADDED_ELEMENT.search(sidecar) is not None or METHOD.encode() in sidecar
+
+
+def remove_position(sidecar: bytes) -> bytes | None:
+    """Return a sidecar as it was before `add_position`; None if there was none.
+
+    One whose added element another program has changed stays as it is.
+    """
+    former = ADDED_ELEMENT.sub(b"", sidecar)
+    return None if former == NEW_SIDECAR else former
+
+
+def replace_sidecar(folder: Path, path: Path, content: bytes, existing: bytes | None) -> None:
+    """Write a sidecar, whole or not at all; owner, group, mode and extended attributes stay.
+
+    Args:
+        folder: What the sidecar has to be in, behind all links.
+        existing: What the content was made of; None for a new file.
+
+    Raises:
+        Unprocessable: `outside_folder`; `not_a_file`; `owner_differs`, if only another user can
+            write a file with the same owner.
+        Conflict: `changed_meanwhile`, if the file is another than `existing` by now.
+        Misconfigured: `out_unwritable`.
+    """
+    path = path.resolve()  # a link stays a link
+    if not path.is_relative_to(folder.resolve()):
+        raise Unprocessable("outside_folder", f"{printable_path(path)} is outside of the folder.")
+    if path.exists() and not path.is_file():  # reading a FIFO would wait for ever
+        raise Unprocessable("not_a_file", f"{printable_path(path)} is not a regular file.")
+    with atomic_write(path) as file:
+        file.write(content)
+        if existing is not None:
+            _copy_attributes(path, Path(file.name))
+        if (path.read_bytes() if path.exists() else None) != existing:
+            raise Conflict(
+                "changed_meanwhile", "Another program has changed the file meanwhile. Try again."
+            )
+
+
+def _copy_attributes(source: Path, target: Path) -> None:
+    """Give a file the owner, group, mode and extended attributes (so the ACL) of another one."""
+    info, new = source.stat(), target.stat()
+    if (info.st_uid, info.st_gid) != (new.st_uid, new.st_gid):
+        try:
+            os.chown(target, info.st_uid, info.st_gid)
+        except PermissionError as error:
+            raise Unprocessable(
+                "owner_differs",
+                f"The file belongs to user {info.st_uid} and group {info.st_gid}, which writing it "
+                "would change. Run the command as its owner or as root.",
+            ) from error
+    shutil.copystat(source, target)  # last: a change of the owner clears bits of the mode
+    os.utime(target)
 
 
 def _hundredths(value: float) -> str:

@@ -1,14 +1,18 @@
 """`placewise storage backup`, `restore` and `rebuild`.
 
 A backup is a copy of the object store, and a restore ends with a rebuild of the catalog from it.
-`maintenance` does the work; it is imported when a command runs.
+That is imported where it is used: it reads photos, whose libraries not every image contains.
 """
 
 from __future__ import annotations
 
+import contextlib
+import os
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
+from uuid import UUID
 
 import typer
 from rich.markup import escape
@@ -24,11 +28,50 @@ from services.cli.output import (
     progress_bar,
     stage_bars,
 )
+from services.cli.recovery.backup import BackupFolder, create_backup
+from shared.catalog.database.schema import check_schema, migrate, opening
+from shared.catalog.database.session import NO_TIMEOUTS, Catalog
+from shared.catalog.installation import get_or_create_installation, open_installation_store
+from shared.catalog.tables import open_catalog
+from shared.config.embedded_home import lock_home
+from shared.config.settings import Settings
+from shared.errors import Misconfigured
+from shared.storage import OwnedStore
+from shared.storage.open_store import open_store
+from shared.storage.ownership import read_owner
 
 if TYPE_CHECKING:
     from services.cli.recovery.journal_rows import RecoveryReport
 
 MAX_KEYS_SHOWN = 10
+
+
+@contextlib.contextmanager
+def open_storage(settings: Settings, command: str) -> Iterator[tuple[Catalog, OwnedStore]]:
+    """Open the catalog and the object store, whether or not services are running."""
+    if settings.database_url is None and not (settings.placewise_home / "catalog.sqlite").exists():
+        raise Misconfigured(
+            "nothing_stored",
+            f"No catalog found in {settings.placewise_home}. Set PLACEWISE_HOME to the folder of "
+            "the installation, or set DATABASE_URL.",
+        )
+    with contextlib.closing(open_catalog(settings, command, NO_TIMEOUTS)) as catalog:
+        with opening(catalog):
+            check_schema(catalog)
+        yield catalog, open_installation_store(catalog, settings, exclusive=False)
+
+
+@contextlib.contextmanager
+def _open_new_catalog(settings: Settings, command: str) -> Iterator[tuple[Catalog, OwnedStore]]:
+    """Open the catalog, with its tables created, and a store that may not be its own yet."""
+    exclusive = settings.database_url is None
+    with contextlib.ExitStack() as stack:
+        if exclusive:
+            stack.enter_context(lock_home(settings.placewise_home))
+        opened = open_catalog(settings, command, NO_TIMEOUTS)
+        catalog = stack.enter_context(contextlib.closing(opened))
+        migrate(catalog)
+        yield catalog, open_store(settings, exclusive=exclusive)
 
 
 def backup(
@@ -42,10 +85,10 @@ def backup(
     The exit code is 1 if an object that the catalog refers to is missing or damaged. The backup
     then contains everything else.
     """
-    with progress_bar() as bars:
-        from services.cli.operations.maintenance import back_up
-
-        manifest = back_up(read_settings(), out, stage_bars(bars))
+    with progress_bar() as bars, open_storage(read_settings(), "backup") as (catalog, store):
+        with catalog.write() as session:
+            installation_id = get_or_create_installation(session).id
+        manifest = create_backup(catalog, store, installation_id, out, stage_bars(bars))
     if as_json:
         print_json(asdict(manifest))
     else:
@@ -71,21 +114,21 @@ def restore(
 
     An interrupted restore resumes when the command is run again.
     """
-    with progress_bar() as bars:
-        from services.cli.operations import maintenance
+    from services.cli.recovery.restore import open_backup, restore_backup
 
-        restored = maintenance.restore(read_settings(), source, stage_bars(bars))
+    settings, folder = read_settings(), BackupFolder(source)
+    with contextlib.ExitStack() as stack:
+        bars = stack.enter_context(progress_bar())
+        open_backup(folder)  # before anything is created
+        if os.access(source, os.W_OK):  # a read-only folder has no concurrent writer
+            stack.enter_context(folder.lock())
+        catalog, store = stack.enter_context(_open_new_catalog(settings, "restore"))
+        restored = restore_backup(folder, catalog, store, settings, stage_bars(bars))
     if as_json:
         print_json(asdict(restored))
         return
     print_message(f"Restored {restored.objects} objects as of {restored.made_at}.")
     print_recovered(restored.recovered)
-
-
-NOT_RECOVERED_NOTE = (
-    "Unfinished batches and model changes, and the search history and tracks of the last hour, may "
-    "be missing."
-)
 
 
 def rebuild_catalog(as_json: JsonOption = False) -> None:
@@ -94,15 +137,23 @@ def rebuild_catalog(as_json: JsonOption = False) -> None:
     Recovers photos with their metadata, maps, generations, vocabularies, API keys and webhooks. An
     interrupted rebuild resumes when the command is run again.
     """
-    with progress_bar() as bars:
-        from services.cli.operations.maintenance import rebuild
+    from services.cli.recovery import rebuild
 
-        recovered = rebuild(read_settings(), stage_bars(bars))
+    settings = read_settings()
+    with progress_bar() as bars, _open_new_catalog(settings, "rebuild") as (catalog, store):
+        mark = read_owner(store)
+        rebuild.begin_rebuild(catalog, store, UUID(mark) if mark else None)
+        recovered = rebuild.rebuild_catalog(
+            catalog, store, settings, with_unnamed=True, progress=stage_bars(bars)
+        )
     if as_json:
         print_json(asdict(recovered))
         return
     print_recovered(recovered)
-    print_note(NOT_RECOVERED_NOTE)
+    print_note(
+        "Unfinished batches and model changes, and the search history and tracks of the last hour, "
+        "may be missing."
+    )
 
 
 def print_recovered(report: RecoveryReport) -> None:

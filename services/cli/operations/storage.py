@@ -6,14 +6,16 @@ the bucket, and manage orphaned objects and the trash.
 
 from __future__ import annotations
 
+import contextlib
+from collections import Counter
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
 
 from services.cli.environment import read_settings
-from services.cli.operations.backup import backup, rebuild_catalog, restore
+from services.cli.operations.backup import backup, open_storage, rebuild_catalog, restore
 from services.cli.output import (
     JsonOption,
     console,
@@ -24,10 +26,17 @@ from services.cli.output import (
     progress_bar,
     stage_bars,
 )
-
-if TYPE_CHECKING:
-    from services.steward.tasks.orphans import StoreCount
-    from shared.integrity.verify import IntegrityReport
+from services.steward.tasks.orphans import StoreCount, collect_orphans, find_orphans
+from shared.catalog.database.schema import migrate as migrate_tables
+from shared.catalog.installation import get_or_create_installation
+from shared.catalog.tables import open_catalog
+from shared.integrity.referenced_objects import plural
+from shared.integrity.verify import IntegrityReport, repair_descriptors, verify_store
+from shared.jobs import InProcessWakeups
+from shared.storage.keys import TRASH
+from shared.storage.trash import read_hold
+from shared.storage.trash import restore_trash as restore_from_trash
+from shared.telemetry.logs import configure_logging
 
 MAX_FAULTS_SHOWN = 20
 REMEDIES = {
@@ -68,12 +77,17 @@ def verify(
 
     The exit code is 1 if a fault is found, even if it is repaired.
     """
-    from services.cli.operations.maintenance import verify_storage
-
-    with progress_bar() as bars:
-        report, queued = verify_storage(
-            read_settings(), stage_bars(bars), originals=originals, repair=repair
-        )
+    with progress_bar() as bars, open_storage(read_settings(), "verify") as (catalog, store):
+        progress = stage_bars(bars)
+        report = verify_store(catalog, store, originals=originals, progress=progress)
+        for info in find_orphans(catalog, store, age_seconds=0.0):
+            report.orphans += 1
+            report.orphan_bytes += info.size_bytes
+            progress("orphaned objects", report.orphans, report.orphans)
+        trash = [info.size_bytes for info in store.list(TRASH)]
+        report.trash_objects, report.trash_bytes = len(trash), sum(trash)
+        # No wakeup message is needed: workers poll, and the steward sends messages.
+        queued = repair_descriptors(catalog, InProcessWakeups(), report) if repair else None
     if as_json:
         print_json(_report_as_json(report, queued))
     else:
@@ -100,8 +114,6 @@ def _report_as_json(report: IntegrityReport, queued: int | None) -> dict[str, An
 
 
 def _print_report(report: IntegrityReport, queued: int | None) -> None:
-    from shared.integrity.referenced_objects import plural
-
     checked = ", ".join(f"{count} {plural(kind)}" for kind, count in sorted(report.checked.items()))
     print_message(
         f"Checked {checked or 'nothing'} ({report.read_bytes / 1e6:.1f} MB): "
@@ -149,9 +161,12 @@ def migrate() -> None:
     Run it before the services start. It changes nothing where they exist, and refuses the tables of
     another version.
     """
-    from services.cli.operations.maintenance import migrate_catalog
-
-    installation_id = migrate_catalog(read_settings())
+    settings = read_settings()
+    configure_logging(settings, "migrate")
+    with contextlib.closing(open_catalog(settings, "migrate")) as catalog:
+        migrate_tables(catalog)
+        with catalog.write() as session:
+            installation_id = get_or_create_installation(session).id
     print_note(f"The catalog has its tables (installation {installation_id})")
 
 
@@ -185,10 +200,14 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
     Orphans are objects older than ORPHAN_AGE_SECONDS that are not in the catalog. --confirm also
     overrides a hold on garbage collection. Services can keep running.
     """
-    from services.cli.operations.maintenance import collect_storage
-
     settings = read_settings()
-    count, moved, hold = collect_storage(settings, confirm=confirm)
+    age_seconds = settings.orphan_age_seconds
+    with open_storage(settings, "storage") as (catalog, store):
+        count, moved, hold = StoreCount(), 0, read_hold(store)
+        for _ in find_orphans(catalog, store, age_seconds, count):
+            pass
+        while confirm and (batch := collect_orphans(catalog, store, age_seconds, confirmed=True)):
+            moved += batch
     if as_json:
         print_json({"moved": moved, "held": hold is not None, **_as_dict(count)})
         return
@@ -220,9 +239,8 @@ def restore_trash(
     This does not add them to the catalog: they are orphans again and are kept for another
     ORPHAN_AGE_SECONDS. `placewise storage rebuild` creates a catalog from all objects.
     """
-    from services.cli.operations.maintenance import restore_from_trash
-
-    counts = restore_from_trash(read_settings(), prefix)
+    with open_storage(read_settings(), "storage") as (_, store):
+        counts = Counter(was_restored for _, was_restored in restore_from_trash(store, prefix))
     restored, skipped = counts[True], counts[False]
     if as_json:
         print_json({"restored": restored, "kept_in_trash": skipped})

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -29,6 +29,7 @@ from filelock import FileLock, Timeout
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from services.cli.recovery.journal_rows import Progress
 from shared.catalog.database.base import count_rows, db_now
 from shared.catalog.database.session import NO_TIMEOUTS, Catalog
 from shared.catalog.installation import Installation
@@ -62,9 +63,6 @@ COPIED = "copied.jsonl"
 # Not backed up: notes of the store, objects that can be recomputed, temporary objects of requests
 # and jobs, and orphans.
 EXCLUDED_PREFIXES = (OWNER_MARK, IMPORTS, INCOMING, QUERIES, PREVIEWS, TRASH)
-
-BackupProgress = Callable[[str, int, int], object]
-"""Progress callback: what is done, number done, total."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +162,7 @@ def create_backup(
     store: ObjectStore,
     installation_id: UUID,
     path: Path,
-    progress: BackupProgress = lambda what, done, total: None,
+    progress: Progress = lambda what, done, total: None,
 ) -> BackupManifest:
     """Create or update the backup in the folder `path`.
 
@@ -209,7 +207,7 @@ class _Backup:
         store: ObjectStore,
         folder: BackupFolder,
         previous: BackupManifest | None,
-        progress: BackupProgress,
+        progress: Progress,
     ) -> None:
         self._catalog = catalog.with_timeouts(NO_TIMEOUTS)
         self._store = store

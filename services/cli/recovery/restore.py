@@ -15,10 +15,9 @@ from services.cli.recovery.backup import (
     BackedUpObject,
     BackupFolder,
     BackupManifest,
-    BackupProgress,
     list_backup_objects,
 )
-from services.cli.recovery.journal_rows import RecoveryReport
+from services.cli.recovery.journal_rows import Progress, RecoveryReport
 from services.cli.recovery.rebuild import begin_rebuild, rebuild_catalog
 from shared.catalog.database.session import Catalog
 from shared.catalog.installation import Installation
@@ -64,7 +63,7 @@ def restore_backup(
     catalog: Catalog,
     store: OwnedStore,
     settings: Settings,
-    progress: BackupProgress = lambda what, done, total: None,
+    progress: Progress = lambda what, done, total: None,
 ) -> RestoreReport:
     """Restore a backup into an empty catalog and an object store.
 
@@ -108,7 +107,7 @@ def _copy_objects(
     folder: BackupFolder,
     index: dict[str, BackedUpObject],
     store: ObjectStore,
-    progress: BackupProgress,
+    progress: Progress,
 ) -> int:
     """Verify and copy the objects that the store lacks; return their number."""
     source, copied, damaged = folder.objects, 0, []

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import tempfile
 from collections import deque
-from collections.abc import Iterable, Sequence, Sized
+from collections.abc import Iterable, Sized
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 from uuid import UUID
 
 import typer
@@ -24,26 +24,23 @@ from services.cli.output import (
     MapOption,
     ServerOption,
     Table,
+    atomic_write,
+    check_output_path,
     format_percent,
     print_json,
     print_note,
+    print_problem,
     print_table,
     printable_path,
     progress_bar,
 )
 from services.cli.track.frame_sources import (
     FrameTiming,
-    Order,
     SourceFrame,
     read_photo_frames,
     read_video_frames,
 )
-from services.cli.track.track_files import (
-    WRITERS,
-    check_track_files,
-    track_row,
-    write_track_file,
-)
+from services.cli.track.gpx import to_gpx
 from shared.errors import Conflict, InvalidRequest, TooLarge, Unprocessable, UnsupportedMedia
 from shared.tracks.motion import MOTION_MODELS
 
@@ -57,13 +54,7 @@ def track(
         typer.Argument(metavar="SOURCE", exists=True, help="A folder of photos, or a video."),
     ],
     out: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--out",
-            metavar="FILE",
-            help=f"Write the track; the format follows from the extension: {', '.join(WRITERS)}. "
-            "May be repeated.",
-        ),
+        Path | None, typer.Option("--out", metavar="FILE.gpx", help="Write the track as GPX.")
     ] = None,
     motion: Annotated[
         str | None,
@@ -79,13 +70,6 @@ def track(
             help="Seconds between two frames of a video, and between photos without a time.",
         ),
     ] = 1.0,
-    order: Annotated[
-        Order | None,
-        typer.Option(
-            help="Order of the photos. Default: by their EXIF times if all have one, otherwise by "
-            "their names."
-        ),
-    ] = None,
     begin: Annotated[
         datetime | None,
         typer.Option(
@@ -115,12 +99,13 @@ def track(
 ) -> None:
     """Follow the camera that took the photos or the video in SOURCE through a map, frame by frame.
 
-    The photos are not added to the map. The track stays on the server for some time, where the page
+    Photos are in the order of their EXIF times if all have one, otherwise of their names. They are
+    not added to the map. The track stays on the server for some time, where the page
     shows it.
     """
-    files = out or []
-    check_track_files(files)
-    timing = FrameTiming(every, order, begin and begin.replace(tzinfo=UTC))
+    if out is not None:
+        check_output_path(out, ".gpx", "a track")
+    timing = FrameTiming(every, begin and begin.replace(tzinfo=UTC))
     with (
         connect(server, map_name, key) as client,
         progress_bar() as progress,
@@ -140,12 +125,13 @@ def track(
                 raise
             print_note(error.detail)
             result = client.track(begun.track_id)
-    for file in files:
-        write_track_file(file, result)
+    if out is not None:
+        with atomic_write(out) as file:
+            file.write(to_gpx(result))
     if as_json:
         print_json(result)
     else:
-        _print_track(result, files)
+        _print_track(result, out)
 
 
 def _send_frames(
@@ -176,36 +162,29 @@ def _send_frames(
         except (Unprocessable, UnsupportedMedia, TooLarge) as error:
             if error.code == "invalid_field":
                 raise
-            _print_failure(progress, frame.name, error.as_problem())
+            print_problem(error.code, frame.name, error.detail)
             progress.advance(bar)
             continue
         version = sent.version
         ahead.append(sent)
         if len(ahead) > FRAMES_AHEAD:
-            _wait_for_frame(client, track_id, ahead.popleft(), progress)
+            _wait_for_frame(client, track_id, ahead.popleft())
             progress.advance(bar)
     for sent in ahead:
-        _wait_for_frame(client, track_id, sent, progress)
+        _wait_for_frame(client, track_id, sent)
         progress.advance(bar)
     if not version:
         raise InvalidRequest("no_frames", "No frame could be sent.")
 
 
-def _wait_for_frame(client: Client, track_id: UUID, frame: TrackFrame, progress: Progress) -> None:
+def _wait_for_frame(client: Client, track_id: UUID, frame: TrackFrame) -> None:
     while frame.status == "pending":
         frame = client.track_frame(track_id, frame.frame_id, wait_seconds=WAIT_SECONDS)
     if frame.error is not None:
-        _print_failure(progress, frame.filename, frame.error)
+        print_problem(frame.error["code"], frame.filename, frame.error["detail"])
 
 
-def _print_failure(progress: Progress, name: str, problem: dict[str, Any]) -> None:
-    progress.console.print(
-        f"[red]{problem['code']}[/red] {escape(name)}: {escape(str(problem['detail']))}",
-        soft_wrap=True,
-    )
-
-
-def _print_track(track: OneTrack, files: Sequence[Path]) -> None:
+def _print_track(track: OneTrack, out: Path | None) -> None:
     table = Table(
         "time",
         "photo",
@@ -216,20 +195,21 @@ def _print_track(track: OneTrack, files: Sequence[Path]) -> None:
         "place",
     )
     for frame in track.frames:
-        row = track_row(frame)
+        state = frame.state
+        at = state if state is not None and state.latitude is not None else None
         table.add_row(
             f"{frame.captured_at:%H:%M:%S}",
             escape(frame.filename),
-            row["status"],
-            format_percent(row["probability"]),
-            "" if row["latitude"] is None else f"{row['latitude']:.6f}",
-            "" if row["longitude"] is None else f"{row['longitude']:.6f}",
-            escape(row["place"] or ""),
+            state.status if state else frame.status,
+            format_percent(state.probability if state else None),
+            f"{at.latitude:.6f}" if at else "",
+            f"{at.longitude:.6f}" if at else "",
+            escape((state and state.place) or ""),
         )
     print_table(table)
     states = [frame.state for frame in track.frames if frame.state is not None]
     tracked = sum(state.status == "tracking" for state in states)
     print_note(
         f"{tracked} of {len(track.frames)} frames are tracked. Track {track.track_id}"
-        f"{''.join(f', {printable_path(file)}' for file in files)}"
+        + (f", {printable_path(out)}" if out else "")
     )

@@ -6,7 +6,6 @@ import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
-from enum import StrEnum
 from pathlib import Path
 
 from PIL import Image
@@ -19,11 +18,6 @@ UNKNOWN_BEGIN = datetime.fromtimestamp(0, UTC)  # the time of a file is that of 
 MIN_STEP = timedelta(milliseconds=1)  # between photos whose clocks show the same time
 ROUNDING_SECONDS = 1e-6
 JPEG_QUALITY = 92  # of the frames of a video
-
-
-class Order(StrEnum):
-    TIME = "time"
-    NAME = "name"
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,27 +38,18 @@ class FrameTiming:
 
     every_seconds: float
     """between two frames of a video, and between photos in the order of their names"""
-    order: Order | None
-    """of photos; None: by their times if all have one, otherwise by their names"""
     begin: datetime | None
     """time of the first frame; None: of a video when it was recorded, else UNKNOWN_BEGIN"""
 
 
 def read_photo_frames(folder: Path, timing: FrameTiming) -> list[SourceFrame]:
-    """List the photos below a folder in the order of their times or names.
+    """List the photos below a folder by their times, or by their names if one has no time.
 
     Raises:
-        InvalidRequest: `no_photos`; `no_times` if a photo of `Order.TIME` has no time.
+        InvalidRequest: `no_photos`.
     """
     photos = read_folder(folder, None, 0.0)
-    without_time = next((folder / photo.id for photo in photos if photo.time is None), None)
-    if timing.order == Order.TIME and without_time is not None:
-        raise InvalidRequest(
-            "no_times",
-            f"{printable_path(without_time)} has no capture time in its EXIF. Use --order name, "
-            "and --every with the seconds between two photos.",
-        )
-    by_name = timing.order == Order.NAME or without_time is not None
+    by_name = any(photo.time is None for photo in photos)
     first = timing.begin or UNKNOWN_BEGIN
     if by_name:
         _print_clock(timing.begin, None, "photos in the order of their names")

@@ -332,7 +332,7 @@ class ReconstructionJob:
                 "names_unmatched",
                 f"{len(ids)} of the {len(sent.photos)} names in the model are those of exactly one "
                 f"photo of the map, for example not {sent.photos[0].name!r:.200}. Upload the "
-                "model's images: `placewise reconstruct --import MODEL --images DIR`.",
+                "model's images first: `placewise index DIR`.",
             )
         named = [
             photo.model_copy(update={"name": str(ids[photo.name])})

@@ -32,7 +32,6 @@ from services.gateway.uploads.batch import (
     FILES_FIELD,
     MANIFEST_FIELD,
     MAX_PREFIX_BYTES,
-    NDJSON_MEDIA_TYPES,
     PREFIX_FIELD,
     BatchFile,
     BatchUpload,
@@ -61,15 +60,6 @@ from shared.storage.keys import IMPORTS, is_valid_key
 
 router = APIRouter(tags=["batches"])
 
-BATCH_UPLOAD_PATH = "/upload/batch"
-
-_BINARY_SCHEMA = {"type": "string", "format": "binary"}
-_MANIFEST_SCHEMA = {
-    "type": "string",
-    "maxLength": MAX_MANIFEST_BYTES,
-    "description": "JSON lines: `filename` (of a file of the form) or `key` (of an object below "
-    "`imports/`), and any of the fields of `POST /upload`",
-}
 REQUEST_BODY = {
     "requestBody": {
         "required": True,
@@ -81,10 +71,16 @@ REQUEST_BODY = {
                         FILES_FIELD: {
                             "type": "array",
                             "maxItems": MAX_BATCH_PHOTOS,
-                            "items": _BINARY_SCHEMA,
+                            "items": {"type": "string", "format": "binary"},
                             "description": "photos",
                         },
-                        MANIFEST_FIELD: _MANIFEST_SCHEMA,
+                        MANIFEST_FIELD: {
+                            "type": "string",
+                            "maxLength": MAX_MANIFEST_BYTES,
+                            "description": "JSON lines: `filename` (of a file of the form) or "
+                            "`key` (of an object below `imports/`), and any of the fields of "
+                            "`POST /upload`",
+                        },
                         PREFIX_FIELD: {
                             "type": "string",
                             "maxLength": MAX_PREFIX_BYTES,
@@ -94,7 +90,6 @@ REQUEST_BODY = {
                     },
                 }
             },
-            NDJSON_MEDIA_TYPES[0]: {"schema": _MANIFEST_SCHEMA},
         },
     }
 }
@@ -117,7 +112,7 @@ class BatchItemsParams(MapPageParams):
 
 
 @router.post(
-    BATCH_UPLOAD_PATH,
+    "/upload/batch",
     operation_id="upload_batch",
     status_code=202,
     openapi_extra=REQUEST_BODY,

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-from uuid import UUID
-
 from fastapi import APIRouter
 from pydantic import Field
-from sqlalchemy.orm import Session
 
 from services.gateway.admission import ADMIT_JOB
 from services.gateway.authentication import READ, WRITE
@@ -15,11 +11,7 @@ from services.gateway.dependencies import GatewayDep, MapQuery, PageQuery
 from services.gateway.idempotency import IdempotentDep
 from services.gateway.responses import JobAcceptedResponse
 from shared.catalog.chunks import has_geotagged
-from shared.catalog.generations import (
-    Generation,
-    active_generation,
-    list_evaluations,
-)
+from shared.catalog.generations import active_generation, list_evaluations
 from shared.catalog.maps import get_map
 from shared.catalog.photos import PhotoRole
 from shared.errors import Conflict
@@ -64,8 +56,19 @@ def start_evaluation(
     with gateway.catalog.write() as session:
         map_ = get_map(session, query.map)
         generation = active_generation(session, map_.id)
-        params["automatic"] = False
-        job = _new_evaluation_job(session, map_.id, generation, params)
+        if generation is None or not has_geotagged(session, generation.id, PhotoRole.DATABASE):
+            raise Conflict(
+                "nothing_to_evaluate",
+                "The map has no described photo with coordinates or a place. Upload photos with "
+                "coordinates or places, and wait for their jobs.",
+            )
+        job = Job(
+            id=new_id(),
+            map_id=map_.id,
+            kind=JobKind.EVALUATE,
+            priority=Priority.EVALUATION,
+            params={**params, "automatic": False},
+        )
         return idempotent.accept_job(session, job)
 
 
@@ -80,23 +83,4 @@ def read_evaluations(gateway: GatewayDep, query: PageQuery) -> EvaluationsRespon
     return EvaluationsResponse(
         evaluations=[EvaluationResponse.model_validate(row) for row in page],
         next_cursor=next_cursor,
-    )
-
-
-def _new_evaluation_job(
-    session: Session, map_id: UUID, generation: Generation | None, params: dict[str, Any]
-) -> Job:
-    """Create a job that queries the generation with the map's own photos."""
-    if generation is None or not has_geotagged(session, generation.id, PhotoRole.DATABASE):
-        raise Conflict(
-            "nothing_to_evaluate",
-            "The map has no described photo with coordinates or a place. Upload photos with "
-            "coordinates or places, and wait for their jobs.",
-        )
-    return Job(
-        id=new_id(),
-        map_id=map_id,
-        kind=JobKind.EVALUATE,
-        priority=Priority.EVALUATION,
-        params=params,
     )

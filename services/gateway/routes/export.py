@@ -1,4 +1,4 @@
-"""Route that exports the descriptors of a generation as a tar archive.
+"""Route that exports the descriptors of a generation as a tar archive, and archives as responses.
 
 One archive holds the descriptors and the table of their photos, so that both are from the same
 snapshot. It is streamed with one chunk in memory at a time.
@@ -9,10 +9,9 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
-import logging
 import tarfile
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from typing import IO, Any
@@ -33,8 +32,6 @@ from shared.ingest.photo_metadata import escape_csv_text
 from shared.storage import ObjectStore
 from shared.storage.chunks import read_chunk
 
-log = logging.getLogger(__name__)
-
 router = APIRouter(tags=["models"])
 
 SPOOL_BYTES = 8 * 1024 * 1024  # larger tables are spooled to a temporary file
@@ -51,12 +48,30 @@ PHOTO_COLUMNS = (
     Photo.relative_path,
 )
 CSV_HEADER = ("row", "image_id", *(column.key for column in PHOTO_COLUMNS))
-TAR_RESPONSE: dict[int | str, dict[str, Any]] = {
-    200: {
-        "content": {"application/x-tar": {"schema": {"type": "string", "format": "binary"}}},
-        "description": "A tar with `photos.csv`, `names.txt` and `descriptors.npy`.",
-    }
-}
+
+
+def describe_tar(content: str) -> dict[int | str, dict[str, Any]]:
+    """Describe the response with a tar archive in the API's schema."""
+    media = {"application/x-tar": {"schema": {"type": "string", "format": "binary"}}}
+    return {200: {"content": media, "description": content}}
+
+
+def tar_response(
+    name: str, made_at: datetime, members: Iterable[tuple[str, int, Iterable[bytes]]]
+) -> StreamingResponse:
+    """Stream a tar archive of files: name, size in bytes, and content."""
+
+    def stream() -> Iterator[bytes]:
+        for member, size_bytes, content in members:
+            entry = tarfile.TarInfo(member)
+            entry.size, entry.mtime = size_bytes, int(made_at.timestamp())
+            yield entry.tobuf(tarfile.GNU_FORMAT)
+            yield from content
+            yield bytes(-size_bytes % tarfile.BLOCKSIZE)
+        yield bytes(2 * tarfile.BLOCKSIZE)
+
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return StreamingResponse(stream(), media_type="application/x-tar", headers=headers)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +88,7 @@ class _ChunkRows:
     dependencies=[READ],
     operation_id="export_descriptors",
     response_class=StreamingResponse,
-    responses=TAR_RESPONSE,
+    responses=describe_tar("A tar with `photos.csv`, `names.txt` and `descriptors.npy`."),
 )
 def export_descriptors(
     gateway: GatewayDep, generation_id: GenerationId, query: MapQuery
@@ -89,36 +104,17 @@ def export_descriptors(
         names = files.enter_context(tempfile.SpooledTemporaryFile(SPOOL_BYTES))
         chunks = _write_tables(session, generation, table, names)
         header = _npy_header(sum(len(chunk.rows) for chunk in chunks), generation.dimension)
-        files = files.pop_all()  # closed by `stream`
+        files = files.pop_all()  # closed by `members`
     rows = sum(len(chunk.rows) for chunk in chunks)
     size = len(header) + rows * generation.dimension * np.dtype(np.float32).itemsize
-    members = [("photos.csv", table.tell()), ("names.txt", names.tell()), ("descriptors.npy", size)]
 
-    def stream() -> Iterator[bytes]:
+    def members() -> Iterator[tuple[str, int, Iterable[bytes]]]:
         with files:
-            contents = (
-                _read_blocks(table),
-                _read_blocks(names),
-                _stream_rows(gateway.store, header, chunks),
-            )
-            for (name, size_bytes), content in zip(members, contents, strict=True):
-                entry = tarfile.TarInfo(name)
-                entry.size, entry.mtime = size_bytes, int(generation.created_at.timestamp())
-                yield entry.tobuf(tarfile.GNU_FORMAT)
-                yield from content
-                yield bytes(-size_bytes % tarfile.BLOCKSIZE)
-            yield bytes(2 * tarfile.BLOCKSIZE)
+            yield "photos.csv", table.tell(), _read_blocks(table)
+            yield "names.txt", names.tell(), _read_blocks(names)
+            yield "descriptors.npy", size, _stream_rows(gateway.store, header, chunks)
 
-    length = sum(_padded_to_block(size_bytes) + tarfile.BLOCKSIZE for _, size_bytes in members)
-    return StreamingResponse(
-        stream(),
-        media_type="application/x-tar",
-        headers={
-            # So that clients can detect an incomplete download.
-            "Content-Length": str(length + 2 * tarfile.BLOCKSIZE),
-            "Content-Disposition": f'attachment; filename="descriptors-{generation.id}.tar"',
-        },
-    )
+    return tar_response(f"descriptors-{generation.id}.tar", generation.created_at, members())
 
 
 def _write_tables(
@@ -177,7 +173,3 @@ def _read_blocks(file: IO[bytes]) -> Iterator[bytes]:
     file.seek(0)
     while piece := file.read(STREAM_READ_BYTES):
         yield piece
-
-
-def _padded_to_block(size_bytes: int) -> int:
-    return size_bytes + -size_bytes % tarfile.BLOCKSIZE

@@ -7,9 +7,10 @@ validates it (`services.extractor.added_models`).
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Path, Request
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
@@ -25,7 +26,12 @@ from services.gateway.dependencies import (
 )
 from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
 from services.gateway.responses import JobAcceptedResponse
-from services.gateway.uploads.multipart import FormFile, multipart_schema, receive_form_file
+from services.gateway.uploads.multipart import (
+    FormFile,
+    multipart_schema,
+    parse_form,
+    receive_form_file,
+)
 from shared.catalog.maps import get_map
 from shared.catalog.models import (
     Model,
@@ -34,7 +40,7 @@ from shared.catalog.models import (
     list_registered_models,
     remove_model,
 )
-from shared.errors import PlacewiseError, TooLarge, invalid_field_error
+from shared.errors import PlacewiseError, TooLarge
 from shared.extractor_config.names import (
     MAX_NAME_CHARACTERS,
     MODEL_NAME_PATTERN,
@@ -49,29 +55,6 @@ from shared.storage.keys import new_checkpoint_key
 
 # The largest backbone (ViT-g) has 4.5 GB of weights. Only admins add models.
 MAX_CHECKPOINT_BYTES = 6_000_000_000
-MAX_LICENCE_CHARACTERS = 1000
-MAX_NOTE_CHARACTERS = 4000
-MODEL_FORM_FIELDS: dict[str, dict[str, Any]] = {
-    "name": {
-        "type": "string",
-        "pattern": MODEL_NAME_PATTERN,
-        "description": "maps use the model as gsv:NAME, torchscript:NAME or onnx:NAME; a name is "
-        "never reused for other weights",
-    },
-    "options": {
-        "type": "string",
-        "maxLength": MAX_NAME_CHARACTERS,
-        "description": "of a TorchScript or ONNX file: what its network expects, and the "
-        "aggregator, such as input.size=288x288,aggregator=vlad",
-    },
-    "licence": {
-        "type": "string",
-        "maxLength": MAX_LICENCE_CHARACTERS,
-        "description": "licence of the weights",
-    },
-    "note": {"type": "string", "maxLength": MAX_NOTE_CHARACTERS, "description": "free text"},
-}
-
 router = APIRouter(tags=["models"])
 
 ModelNamePath = Annotated[
@@ -91,6 +74,36 @@ def _model_response(session: Session, model: Model) -> ModelResponse:
     )
 
 
+class ModelForm(BaseModel):
+    """The text fields of the form."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: str = Field(
+        description="maps use the model as gsv:NAME, torchscript:NAME or onnx:NAME; a name is "
+        "never reused for other weights",
+        json_schema_extra={"pattern": MODEL_NAME_PATTERN},
+    )
+    options: str | None = Field(
+        None,
+        max_length=MAX_NAME_CHARACTERS,
+        pattern=NO_NUL_PATTERN,
+        description="of a TorchScript or ONNX file: what its network expects, and the "
+        "aggregator, such as input.size=288x288,aggregator=vlad",
+    )
+    licence: str | None = Field(
+        None, max_length=1000, pattern=NO_NUL_PATTERN, description="licence of the weights"
+    )
+    note: str | None = Field(None, max_length=4000, pattern=NO_NUL_PATTERN, description="free text")
+
+    @field_validator("name")
+    @classmethod
+    def _validate_name(cls, name: str) -> str:
+        if not re.fullmatch(MODEL_NAME_PATTERN, name):
+            raise ValueError(MODEL_NAME_RULE)
+        return name
+
+
 class ModelsResponse(ResponseModel):
     models: list[ModelResponse]
 
@@ -102,7 +115,7 @@ class ModelsResponse(ResponseModel):
     openapi_extra=multipart_schema(
         "a checkpoint (`.ckpt`) of `placewise train`, a TorchScript or an `.onnx` file",
         ["name"],
-        **MODEL_FORM_FIELDS,
+        **ModelForm.model_json_schema()["properties"],
     ),
     dependencies=[ADMIN, ADMIT_JOB],
 )
@@ -145,7 +158,7 @@ def _queue_model(
                 "object_key": upload.key,
                 "filename": upload.filename,
                 "checkpoint_sha256": upload.sha256,
-                **_parse_model_fields(upload.fields),
+                **parse_form(ModelForm, upload.fields).model_dump(),
             },
         )
         accepted = idempotent.accept_job(session, job)
@@ -181,31 +194,6 @@ def delete_model(gateway: GatewayDep, name: ModelNamePath) -> RemovedModelRespon
     return RemovedModelResponse(
         success=True, message=f"The model {name} is removed.", removed_model=name
     )
-
-
-def _parse_model_fields(fields: dict[str, str]) -> dict[str, str | None]:
-    """Validate and return the fields `name`, `options`, `licence` and `note` of the form."""
-    for field in fields.keys() - MODEL_FORM_FIELDS.keys():
-        raise invalid_field_error(field, f"is unknown; valid are {', '.join(MODEL_FORM_FIELDS)}")
-    name = fields.get("name", "")
-    if not re.fullmatch(MODEL_NAME_PATTERN, name):
-        raise invalid_field_error("name", MODEL_NAME_RULE)
-    for field, max_characters in (
-        ("options", MAX_NAME_CHARACTERS),
-        ("licence", MAX_LICENCE_CHARACTERS),
-        ("note", MAX_NOTE_CHARACTERS),
-    ):
-        value = fields.get(field, "")
-        if len(value) > max_characters or "\x00" in value:
-            raise invalid_field_error(
-                field, f"must have at most {max_characters} characters, without NUL"
-            )
-    return {
-        "name": name,
-        "options": fields.get("options") or None,
-        "licence": fields.get("licence") or None,
-        "note": fields.get("note") or None,
-    }
 
 
 def _checkpoint_too_large_error(max_bytes: int) -> PlacewiseError:

@@ -310,14 +310,7 @@ def read_preview(
 def _queue_preview(
     session: Session, admission: AdmissionControl, photo: Photo, map_name: str
 ) -> Job:
-    """Return the photo's job, queued again unless it is unfinished.
-
-    Describing a photo again makes its preview; its stored descriptor is unchanged.
-
-    Raises:
-        NotFound: `preview_not_found` if the photo can't be described.
-        TooManyRequests: `queue_full`.
-    """
+    """Return the photo's job, which makes the preview; queued again unless it is unfinished."""
     job = session.get(Job, photo.job_id, with_for_update=True) if photo.job_id else None
     if job is not None and job.state in UNFINISHED_STATES:
         return job

@@ -166,7 +166,7 @@ async def complete_presigned_upload(
 ) -> UploadResponse:
     """Complete a presigned upload: validate the sent file and store the photo.
 
-    The responses are those of `POST /upload`. A repeated request gets the same response again.
+    The responses are those of `POST /upload`. A repeated request gets the job of the first one.
     """
     # Executed once, as a request with an Idempotency-Key is.
     idempotent = IdempotentRequest(gateway, request, response, f"upload-{upload_id}")
@@ -175,12 +175,7 @@ async def complete_presigned_upload(
             _complete_upload, request, gateway, query.map, upload_id, idempotent
         )
     job = await wait_for_description(request, response, gateway, stored)
-    outcome = UploadOutcome.of(stored, job, query.map)
-    if outcome.status == 201:
-        await run_in_threadpool(
-            idempotent.replace_response, outcome.status, outcome.body, outcome.headers
-        )
-    return outcome.send(response)
+    return UploadOutcome.of(stored, job, query.map).send(response)
 
 
 def _complete_upload(
@@ -220,7 +215,11 @@ def _store_copy(
         _check_object_size(store.head(source_key), upload)
         store.copy(source_key, key)
     except NotFound:
-        raise _upload_incomplete_error(upload) from None
+        raise Conflict(
+            "upload_incomplete",
+            f"No file was sent for the upload {upload.id} yet. PUT it to the URL of the upload "
+            "first.",
+        ) from None
     with delete_if_refused(store, key):
         photo = _validate_copy(request, gateway, store, key, upload)
         with reserve_photo_quota(request, gateway.settings), gateway.catalog.write() as session:
@@ -266,13 +265,6 @@ def _check_object_size(info: ObjectInfo | None, upload: PresignedUpload) -> None
             f"The file that was sent has {info.size_bytes} bytes, not {upload.size_bytes}. Send "
             "the announced file again to the same URL, or start a new upload.",
         )
-
-
-def _upload_incomplete_error(upload: PresignedUpload) -> Conflict:
-    return Conflict(
-        "upload_incomplete",
-        f"No file was sent for the upload {upload.id} yet. PUT it to the URL of the upload first.",
-    )
 
 
 def _parse_photo_fields(values: dict[str, Any]) -> PhotoFields:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tarfile
 from collections import Counter
 from collections.abc import Iterator
 from typing import Any
@@ -19,6 +18,7 @@ from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import GatewayContext, GatewayDep, MapQuery, ReconstructionId
 from services.gateway.idempotency import IdempotentDep, IdempotentRequest
 from services.gateway.responses import JobAcceptedResponse
+from services.gateway.routes.export import describe_tar, tar_response
 from shared.catalog.database.base import get_in_map
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import get_map, lock_map
@@ -50,13 +50,6 @@ IMPORT_PATH = "/reconstructions/import"
 MAX_MODEL_BYTES = 16_000_000
 """Of cameras and poses as JSON; a pose takes about 300 bytes"""
 COORDINATE_TOLERANCE_M = 0.02
-TAR_RESPONSE: dict[int | str, dict[str, Any]] = {
-    200: {
-        "content": {"application/x-tar": {"schema": {"type": "string", "format": "binary"}}},
-        "description": "A tar with a folder for each component: `0/cameras.bin`, `0/images.bin`, "
-        "`0/points3D.bin`, `0/frames.bin`, `0/rigs.bin`, `1/...`.",
-    }
-}
 
 
 class ReconstructRequest(RequestModel):
@@ -251,7 +244,10 @@ def _get_finished(session: Session, map_name: str, reconstruction_id: UUID) -> R
     operation_id="export_colmap",
     dependencies=[READ],
     response_class=StreamingResponse,
-    responses=TAR_RESPONSE,
+    responses=describe_tar(
+        "A tar with a folder for each component: `0/cameras.bin`, `0/images.bin`, "
+        "`0/points3D.bin`, `0/frames.bin`, `0/rigs.bin`, `1/...`."
+    ),
 )
 def export_colmap(
     gateway: GatewayDep, reconstruction_id: ReconstructionId, query: MapQuery
@@ -275,20 +271,11 @@ def export_colmap(
         name = names.get(photo_id, photo_id)
         return name if shared[name] == 1 and name.isprintable() else photo_id
 
-    def stream() -> Iterator[bytes]:
+    def members() -> Iterator[tuple[str, int, list[bytes]]]:
         for key in sorted(keys):
             data = gateway.store.get(key)
             if key.endswith("/images.bin"):
                 data = rename_images(data, image_name)
-            entry = tarfile.TarInfo("/".join(key.split("/")[-2:]))
-            entry.size, entry.mtime = len(data), int(made_at.timestamp())
-            yield entry.tobuf(tarfile.GNU_FORMAT) + data + bytes(-len(data) % tarfile.BLOCKSIZE)
-        yield bytes(2 * tarfile.BLOCKSIZE)
+            yield "/".join(key.split("/")[-2:]), len(data), [data]
 
-    return StreamingResponse(
-        stream(),
-        media_type="application/x-tar",
-        headers={
-            "Content-Disposition": f'attachment; filename="reconstruction-{found.id}.tar"',
-        },
-    )
+    return tar_response(f"reconstruction-{found.id}.tar", made_at, members())

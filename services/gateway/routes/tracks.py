@@ -42,10 +42,10 @@ from services.gateway.similarity.search_params import SearchParams
 from services.gateway.tracks.apply_frames import apply_pending_frames, smooth_states
 from services.gateway.tracks.schemas import (
     FRAME_FIELDS,
+    FrameForm,
     TrackParams,
-    parse_frame_form,
 )
-from services.gateway.uploads.multipart import FormFile, multipart_schema
+from services.gateway.uploads.multipart import FormFile, multipart_schema, parse_form
 from services.gateway.uploads.query_photo import describe_query_job, receive_query_photo
 from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import QUERY_TTL_SECONDS
@@ -280,7 +280,7 @@ def _accept_frame(
     """Store the frame with its job, or return the frame that it repeats."""
     received = file.complete()
     with idempotent.begin_form(received, QUERY_TTL_SECONDS):
-        form = parse_frame_form(received.fields)
+        form = parse_form(FrameForm, received.fields)
         with received.open(gateway.store) as photo:
             header = read_photo_header(photo, gateway.settings.max_image_pixels)
         with reserve_photo_quota(request, gateway.settings), gateway.catalog.write() as session:

@@ -123,12 +123,7 @@ async def upload_photo(
                 _store_upload, request, gateway, query.map, file, idempotent
             )
     job = await wait_for_description(request, response, gateway, stored)
-    outcome = UploadOutcome.of(stored, job, query.map)
-    if outcome.status == 201:
-        await run_in_threadpool(
-            idempotent.replace_response, outcome.status, outcome.body, outcome.headers
-        )
-    return outcome.send(response)
+    return UploadOutcome.of(stored, job, query.map).send(response)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,10 +6,9 @@ from datetime import datetime
 from typing import Annotated, Any, Literal, Self
 from uuid import UUID
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from services.gateway.dependencies import NO_NUL_PATTERN
-from shared.errors import invalid_field_error
 from shared.geodesy import distance_m
 from shared.http.request_model import RequestModel
 from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS, parse_time
@@ -138,21 +137,6 @@ class FrameForm(BaseModel):
 
 
 FRAME_FIELDS: dict[str, dict[str, Any]] = FrameForm.model_json_schema()["properties"]
-
-
-def parse_frame_form(fields: dict[str, str]) -> FrameForm:
-    """Parse the text fields of a frame's form; an empty field counts as missing.
-
-    Raises:
-        Unprocessable: `invalid_field`.
-    """
-    values = {name: value.strip() for name, value in fields.items() if value.strip()}
-    try:
-        return FrameForm.model_validate(values)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        name = str(first["loc"][0]) if first["loc"] else "form"
-        raise invalid_field_error(name, first["msg"].removeprefix("Value error, ")) from None
 
 
 def track_state_response(state: TrackState, fix: PositionFix | None) -> TrackStateResponse:

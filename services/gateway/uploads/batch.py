@@ -15,7 +15,7 @@ from typing import Any
 from fastapi import Request
 from starlette.concurrency import run_in_threadpool
 
-from services.gateway.uploads.multipart import MultipartFormParser, body_media_type
+from services.gateway.uploads.multipart import MultipartFormParser
 from shared.config.settings import Settings
 from shared.errors import InvalidRequest, PlacewiseError, TooLarge, invalid_field_error
 from shared.imaging.file_formats import photo_suffix
@@ -25,7 +25,6 @@ from shared.storage import ObjectStore, ObjectWriter
 from shared.storage.keys import new_original_key
 
 FILES_FIELD, MANIFEST_FIELD, PREFIX_FIELD = "file", "manifest", "prefix"
-NDJSON_MEDIA_TYPES = ("application/x-ndjson", "application/jsonl", "application/x-jsonlines")
 # Of all files of one request, which takes a quarter of an hour at 100 Mbit/s: an interrupted one
 # begins again, and several requests can be sent.
 MAX_FILES_BYTES = 10 * 2**30
@@ -74,8 +73,6 @@ async def parse_batch_upload(
         UnsupportedMedia: `unsupported_body`.
         Unprocessable: `invalid_field`.
     """
-    if body_media_type(request) in NDJSON_MEDIA_TYPES:
-        return BatchUpload(manifest=await _read_manifest_body(request))
     max_bytes = (
         MAX_FILES_BYTES + MAX_MANIFEST_BYTES + settings.max_batch_photos * MAX_PART_HEADER_BYTES
     )
@@ -117,15 +114,6 @@ def _batch_too_large_error() -> PlacewiseError:
         "into several.",
         max_bytes=MAX_FILES_BYTES,
     )
-
-
-async def _read_manifest_body(request: Request) -> bytes:
-    data = bytearray()
-    async for piece in request.stream():
-        data += piece
-        if len(data) > MAX_MANIFEST_BYTES:
-            raise _manifest_too_large_error()
-    return bytes(data)
 
 
 class _BatchPartHandler:
@@ -187,7 +175,11 @@ class _BatchPartHandler:
         if self._name == MANIFEST_FIELD:
             self._manifest += piece
             if len(self._manifest) > MAX_MANIFEST_BYTES:
-                raise _manifest_too_large_error()
+                raise TooLarge(
+                    "manifest_too_large",
+                    f"The manifest is larger than {MAX_MANIFEST_BYTES} bytes. Split it into "
+                    "several.",
+                )
             return
         if self._name == PREFIX_FIELD:
             self._prefix += piece
@@ -266,11 +258,4 @@ def _conflicting_sources_error(what: str) -> PlacewiseError:
         "several_sources",
         f"The form has {what}. A batch is one of: photos ({FILES_FIELD!r}) with an optional "
         f"{MANIFEST_FIELD!r}; one {MANIFEST_FIELD!r} of keys; one {PREFIX_FIELD!r} of keys.",
-    )
-
-
-def _manifest_too_large_error() -> PlacewiseError:
-    return TooLarge(
-        "manifest_too_large",
-        f"The manifest is larger than {MAX_MANIFEST_BYTES} bytes. Split it into several.",
     )

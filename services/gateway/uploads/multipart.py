@@ -10,20 +10,29 @@ from __future__ import annotations
 import contextlib
 from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from fastapi import Request
+from pydantic import BaseModel, ValidationError
 from python_multipart.exceptions import MultipartParseError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.concurrency import run_in_threadpool
 
-from shared.errors import InvalidRequest, PlacewiseError, TooLarge, UnsupportedMedia
+from shared.errors import (
+    InvalidRequest,
+    PlacewiseError,
+    TooLarge,
+    UnsupportedMedia,
+    invalid_field_error,
+)
 from shared.ingest.validation import StoredUpload, StreamValidator, base_name, file_too_large_error
 from shared.storage import ObjectStore, ObjectWriter
 
 MAX_FIELDS_BYTES = 256 * 1024  # all text fields together
 # Allowed size of a body without its files: boundaries, part headers and text fields.
 OVERHEAD_BYTES = MAX_FIELDS_BYTES + 64 * 1024
+
+Form = TypeVar("Form", bound=BaseModel)
 
 
 class PartHandler(Protocol):
@@ -135,12 +144,6 @@ def _malformed_body_error(reason: str) -> PlacewiseError:
     return InvalidRequest("malformed_body", f"The multipart body can't be read: {reason}.")
 
 
-def body_media_type(request: Request) -> str:
-    """Return the media type of the body in lower case, without parameters; "" if not given."""
-    media_type, _ = parse_options_header(request.headers.get("content-type", ""))
-    return media_type.decode("latin-1").lower()
-
-
 def _parse_boundary(request: Request) -> bytes:
     media_type, options = parse_options_header(request.headers.get("content-type", ""))
     if media_type != b"multipart/form-data":
@@ -239,6 +242,21 @@ async def receive_form_file(
         if writer is not None:
             await run_in_threadpool(writer.abort)
         raise
+
+
+def parse_form(model: type[Form], fields: dict[str, str]) -> Form:
+    """Parse the text fields of a form; an empty field counts as missing.
+
+    Raises:
+        Unprocessable: `invalid_field`.
+    """
+    values = {name: value.strip() for name, value in fields.items() if value.strip()}
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        name = str(first["loc"][0]) if first["loc"] else "form"
+        raise invalid_field_error(name, first["msg"].removeprefix("Value error, ")) from None
 
 
 def multipart_schema(

@@ -84,11 +84,13 @@ def choose_threshold(estimates: Sequence[HeldOutEstimate], certainty: float) -> 
     """Return the lowest probability above which the share `certainty` of the answers is right.
 
     It is at least the probability with MAX_ERROR_FACTOR times the error that is allowed on
-    average, and 0.5: queries may be harder than the samples. Without such a probability, it is the
-    certainty itself.
+    average, and 0.5: queries may be harder than the samples. Where no sample is, the probabilities
+    themselves count: those above 2 * certainty - 1 are the certainty in the mean if they are evenly
+    distributed. So that is the most if all samples are surer, or too few to tell without being
+    wrong more often; if they are, it is the certainty itself.
     """
     # The last level, the whole map, is no answer to where.
-    depth = max((len(s.probabilities) - 1 for s in estimates), default=0)
+    depth = max([1, *(len(s.probabilities) - 1 for s in estimates)])
     probabilities = np.full((len(estimates), depth), -1.0)
     known = np.zeros((len(estimates), depth))
     wrong = np.zeros((len(estimates), depth))
@@ -99,13 +101,15 @@ def choose_threshold(estimates: Sequence[HeldOutEstimate], certainty: float) -> 
             known[row, position] = 0.0 if right is None else estimate.weight
             wrong[row, position] = estimate.weight if right is False else 0.0
     floor = max(0.5, 1 - MAX_ERROR_FACTOR * (1 - certainty))
+    unseen = max(floor, 2 * certainty - 1)
     distinct = np.unique(probabilities[probabilities >= floor])
-    for candidate in distinct[:: max(1, -(-len(distinct) // CANDIDATES))]:
+    tried = distinct[:: max(1, -(-len(distinct) // CANDIDATES))].tolist()
+    # One more wrong answer is counted: a new query may be one.
+    for candidate, more in [*((each, 1.0) for each in tried), (unseen, 0.0)]:
         reached = probabilities >= candidate
         answered = np.flatnonzero(reached.any(axis=1))
         position = reached.argmax(axis=1)[answered]
-        # One more wrong answer is counted: a new query may be one.
-        error = (wrong[answered, position].sum() + 1) / (known[answered, position].sum() + 1)
-        if error <= 1 - certainty + 1e-9:
-            return float(candidate)
+        mistaken, judged = wrong[answered, position].sum(), known[answered, position].sum()
+        if mistaken + more <= (1 - certainty) * (judged + more) + 1e-9:
+            return min(candidate, unseen) if candidate in tried[:1] else candidate
     return certainty

@@ -9,18 +9,17 @@ from datetime import timedelta
 from pathlib import Path
 
 import pytest
-from filelock import FileLock
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
 from services.cli.immich import api
 from services.cli.immich.library import ImmichLibrary
+from services.cli.locate.folder import FolderLibrary
 from services.cli.locate.library import LibraryPhoto, LocatedPhoto, PhotoLibrary
-from services.cli.locate.sidecars import add_position
-from services.cli.locate.undo_journal import FOLDER
-from services.cli.locate.writers import FolderLibrary
-from shared.errors import Conflict, NotFound, Unprocessable
+from services.cli.locate.sidecars import METHOD
+from shared.errors import NotFound
 from shared.geotagging.fusion import Proposal
+from shared.imaging.xmp import EXIF, RDF
 from tests.support.immich_server import KEY, NOON, ImmichServer, running_immich
 from tests.support.photos import encoded, exif_with_position, photo_bytes, photo_image
 
@@ -31,8 +30,6 @@ class Case(ABC):
     """A library, and what its owner does to it beside Placewise."""
 
     library: PhotoLibrary
-    journal: Path
-    lock: Path
 
     @abstractmethod
     def add(self, number: int, seconds: float, position: tuple[float, float] | None) -> str:
@@ -50,8 +47,6 @@ class FolderCase(Case):
     def __init__(self, folder: Path) -> None:
         self.folder = folder / "trip"
         self.folder.mkdir()
-        self.journal = self.folder / FOLDER / "journal.jsonl"
-        self.lock = self.journal.with_name("lock")
         self.library = FolderLibrary(self.folder)
 
     def add(self, number: int, seconds: float, position: tuple[float, float] | None) -> str:
@@ -65,7 +60,14 @@ class FolderCase(Case):
         return f"IMG_{number}.jpg"
 
     def place(self, name: str, position: tuple[float, float]) -> None:
-        (self.folder / f"{name}.xmp").write_bytes(add_position(None, *position, 5.0))
+        # As programs do that write all properties of a sidecar anew.
+        latitude, longitude = (f"{degrees:.0f},{degrees % 1 * 60:.6f}" for degrees in position)
+        (self.folder / f"{name}.xmp").write_text(
+            f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="{RDF}"><rdf:Description'
+            f' xmlns:exif="{EXIF}" exif:GPSProcessingMethod="{METHOD}"'
+            f' exif:GPSLatitude="{latitude}N" exif:GPSLongitude="{longitude}E"/>'
+            "</rdf:RDF></x:xmpmeta>"
+        )
 
     def delete(self, name: str) -> None:
         (self.folder / name).unlink()
@@ -75,8 +77,6 @@ class ImmichCase(Case):
     def __init__(self, folder: Path, immich: ImmichServer) -> None:
         self.immich = immich
         self.library = ImmichLibrary(api.ImmichApi(immich.url, KEY), folder / "journals")
-        self.journal = folder / "journals" / f"{self.library.identity.split(':')[1]}.jsonl"
-        self.lock = self.journal.with_suffix(".lock")
 
     def add(self, number: int, seconds: float, position: tuple[float, float] | None) -> str:
         name = f"IMG_{number}.jpg"
@@ -190,7 +190,7 @@ def test_undo_leaves_what_was_changed_since_alone_and_names_it(case: Case) -> No
     assert len(undone.restored + undone.removed) == 1
     assert listed(case)[names[0]].latitude == pytest.approx(HERE[0], abs=1e-5)
     assert listed(case)[names[1]].is_unlocated
-    assert case.library.undo().changed_since == undone.changed_since, "the journal stays"
+    assert case.library.undo().changed_since == undone.changed_since, "it stays"
 
 
 def test_undo_restores_the_state_before_several_writes(case: Case) -> None:
@@ -208,34 +208,3 @@ def test_a_place_without_coordinates_is_not_written(case: Case) -> None:
     report = case.library.write([LocatedPhoto(photo, None, "tower/floor 7", 0.99, None)])
     assert report.written == []
     assert "has a place only" in report.skipped[photo.name]
-
-
-def test_an_incomplete_last_line_of_the_journal_stands_for_no_change(case: Case) -> None:
-    names = [case.add(number, 0, None) for number in (1, 2)]
-    photos = listed(case)
-    case.library.write([proposed(photos[names[0]])])
-    with case.journal.open("ab") as journal:
-        journal.write(b'{"path": "IM')
-    case.library.write([proposed(photos[names[1]])])
-    case.library.undo()
-    assert all(listed(case)[name].is_unlocated for name in names)
-
-
-def test_a_damaged_journal_is_refused_and_nothing_is_changed(case: Case) -> None:
-    name = case.add(1, 0, None)
-    case.library.write([proposed(listed(case)[name])])
-    case.journal.write_bytes(b"{}\n" + case.journal.read_bytes())
-    with pytest.raises(Unprocessable) as damaged:
-        case.library.undo()
-    assert damaged.value.code == "journal_damaged"
-    assert not listed(case)[name].is_unlocated
-
-
-def test_two_processes_never_write_into_one_library_at_once(case: Case) -> None:
-    names = [case.add(number, 0, None) for number in (1, 2)]
-    photos = listed(case)
-    case.library.write([proposed(photos[names[0]])])
-    with FileLock(case.lock), pytest.raises(Conflict) as refused:
-        case.library.write([proposed(photos[names[1]])])
-    assert refused.value.code == "locate_in_progress"
-    assert listed(case)[names[1]].is_unlocated

@@ -68,21 +68,6 @@ def test_a_fault_cuts_the_connection_that_stands_and_everything_passes_before_an
     assert client.put("/", content=BODY).content == BODY
 
 
-def test_a_cut_connection_ends_within_the_request(proxy: FaultProxy, client: httpx2.Client) -> None:
-    with proxy.in_mode(ProxyMode.CUT):
-        with pytest.raises(httpx2.TransportError):
-            client.put("/", content=BODY)
-        with pytest.raises(httpx2.TransportError):
-            client.get("/")
-
-
-def test_a_slow_connection_brings_everything_in_the_end(
-    proxy: FaultProxy, client: httpx2.Client
-) -> None:
-    with proxy.in_mode(ProxyMode.SLOW):
-        assert client.put("/", content=BODY).content == BODY
-
-
 def test_a_full_store_refuses_writes_and_answers_reads(
     proxy: FaultProxy, client: httpx2.Client
 ) -> None:

@@ -27,7 +27,7 @@ MODULES = {
 COMMAND = [
     "services.cli.main",
     "services.cli.operations.installation_checks",
-    "services.cli.operations.maintenance",
+    "services.cli.operations.storage",
     "shared.catalog.installation",
     "shared.telemetry.heartbeat",
     "alembic.command",

@@ -76,6 +76,10 @@ def serving(**limits: Any) -> Iterator[Running]:
             await asyncio.sleep(wait)
             return len(await request.body())
 
+        @app.post("/json")
+        def parse(body: dict[str, int]) -> int:
+            return len(body)
+
         @app.get("/much")
         async def much() -> StreamingResponse:
             async def pieces() -> Any:
@@ -161,6 +165,15 @@ def test_where_every_connection_is_at_work_a_further_one_is_refused(
             assert b"200 OK" in answer_of(client), "nobody's call was cut short"
 
 
+def test_a_connection_that_is_answered_makes_room_although_its_body_still_comes() -> None:
+    with serving(per_address=1) as server, server.connect() as unread:
+        unread.sendall(HEAD.replace(b"/count", b"/nowhere") + b"x")
+        assert b"404 Not Found" in answer_of(unread)
+        unread.sendall(b"x")
+        assert b"200 OK" in server.ask()
+        assert read_to_the_end(unread) == b""
+
+
 def test_a_trusted_proxy_has_unlimited_connections_and_names_the_client_address() -> None:
     forwarded = ASK.replace(b"\r\n\r\n", b"\r\nX-Forwarded-For: 192.0.2.7\r\n\r\n")
     with serving(per_address=2, trusted_proxies=(ip_network("127.0.0.2/32"),)) as server:
@@ -180,14 +193,11 @@ def test_a_head_that_does_not_come_in_time_ends_the_connection() -> None:
             slow.sendall(b"GET /whoami HT")
             retained.sendall(ASK)
             assert b"200 OK" in answer_of(retained)
-            assert read_to_the_end(silent) == b""
-            answer = read_to_the_end(slow)
-            assert answer.startswith(b"HTTP/1.1 408 Request Timeout")
-            assert b"request_too_slow" in answer
+            assert read_to_the_end(silent) == read_to_the_end(slow) == b""
             retained.sendall(ASK)
             assert b"200 OK" in answer_of(retained), "it may be idle between two calls"
             retained.sendall(b"GET /")
-            assert b"408 Request Timeout" in read_to_the_end(retained), "not within one"
+            assert read_to_the_end(retained) == b"", "not within one"
         assert server.connections.closed[Reason.SLOW_HEAD] == 3
         wait_until(lambda: server.connections.count == 0)
 
@@ -196,23 +206,25 @@ def test_a_body_that_comes_too_slowly_is_answered_408_and_no_error_is_logged(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     with serving(body_bytes_per_second=1000, body_window_seconds=0.5) as server:
-        with server.connect() as slow, server.connect() as fast, server.connect() as unread:
+        with (
+            server.connect() as slow,
+            server.connect() as slow_json,
+            server.connect() as fast,
+        ):
             slow.sendall(HEAD + b"x")
-            # Answered before its body has come, which goes on to be read.
-            unread.sendall(HEAD.replace(b"POST /count", b"POST /nowhere") + b"x")
-            assert b"404 Not Found" in answer_of(unread)
+            slow_json.sendall(HEAD.replace(b"/count", b"/json") + b"x")
             fast.sendall(HEAD)
             for _ in range(20):
                 fast.sendall(b"x" * 10_000)
                 time.sleep(0.1)
             assert b"200000" in answer_of(fast)
-            answer = read_to_the_end(slow)
-            assert answer.startswith(b"HTTP/1.1 408 Request Timeout")
-            assert b"request_too_slow" in answer
-            read_to_the_end(unread)
+            for client in (slow, slow_json):
+                answer = read_to_the_end(client)
+                assert answer.startswith(b"HTTP/1.1 408 Request Timeout")
+                assert b"request_too_slow" in answer
         wait_until(lambda: len(server.calls) == 3)
         assert server.connections.closed[Reason.SLOW_BODY] == 2
-        assert sorted(call.status for call in server.calls) == [200, 404, 408]
+        assert sorted(call.status for call in server.calls) == [200, 408, 408]
     assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
 
 
@@ -257,9 +269,7 @@ def test_a_response_that_the_client_does_not_read_ends_the_connection() -> None:
         wait_until(lambda: server.connections.count == 0)
 
 
-def test_accept_errors_are_counted_and_one_line_a_minute_is_logged(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_accept_errors_are_counted_and_not_logged(caplog: pytest.LogCaptureFixture) -> None:
     connections = Connections(LIMITS)
     passed: list[dict[str, Any]] = []
 
@@ -269,11 +279,8 @@ def test_accept_errors_are_counted_and_one_line_a_minute_is_logged(
 
     for _ in range(1000):
         connections.on_loop_error(Loop(), {"exception": OSError(errno.EMFILE, "too many")})
-        connections.check()
     assert connections.closed[Reason.ACCEPT_ERROR] == 1000
-    assert [record.getMessage() for record in caplog.records] == [
-        "Connections closed or refused: accept_error 1; open now: 0"
-    ]
+    assert not caplog.records
     connections.on_loop_error(Loop(), {"exception": ValueError("ours")})
     assert len(passed) == 1
 

@@ -113,8 +113,7 @@ def test_the_largest_model_that_is_allowed_can_be_imported(door: Door) -> None:
 
 def test_a_manifest_is_read_line_by_line_up_to_its_limits(door: Door) -> None:
     def send(data: bytes) -> Any:
-        headers = {"Content-Type": "application/x-ndjson"}
-        return door(ADMIN, "POST", "/upload/batch", content=data, headers=headers)
+        return door(ADMIN, "POST", "/upload/batch", files={"manifest": ("m.jsonl", data)})
 
     one_line = b'{"key": "imports/a", "tags": [' + b"{}," * 400_000 + b"{}]}"
     assert "line 1" in problem(send(one_line), 400, "bad_manifest")["detail"]

@@ -133,40 +133,22 @@ def test_matching_is_automatic_where_it_improves_the_answers(
     assert (only["matches"]["compared"], only["matches"]["missing"]) == (0, 1)
 
 
-@pytest.mark.parametrize(
-    ("features", "reason"),
-    [
-        (None, "no local features"),
-        (NO_KEYPOINTS, "too little texture"),
-        (LocalFeatures.empty((8, 8), 64), "shorter than 240 pixels"),
-    ],
-)
 def test_query_without_usable_features_is_answered_with_the_reason(
-    service: Service, ids: list[str], features: LocalFeatures | None, reason: str
+    service: Service, ids: list[str]
 ) -> None:
-    answer = ask(service, features, rerank=3, explain="true")
+    answer = ask(service, NO_KEYPOINTS, rerank=3, explain="true")
     assert len(answer["similar_images"]) == PHOTOS
     assert set(inliers_of(answer).values()) == {None}
     assert (answer["matches"]["compared"], answer["matches"]["missing"]) == (0, PHOTOS)
-    assert reason in answer["matches"]["reason"]
+    assert "too little texture" in answer["matches"]["reason"]
 
 
-@pytest.mark.parametrize("damage", ["another model", "truncated", "no file", "never computed"])
 def test_features_that_cannot_be_used_leave_the_answer_as_without_them(
-    service: Service, ids: list[str], damage: str
+    service: Service, ids: list[str]
 ) -> None:
-    with service.catalog.write() as session:
+    with service.catalog.read() as session:
         for chunk in session.query(Chunk):
-            key = features_key(chunk.object_key)
-            if damage == "another model":
-                rows = [scene_features(1)] * chunk.rows
-                put_features(service.store, *rows, key=key, model="aliked-n16@0123456789ab")
-            elif damage == "truncated":
-                service.store.put(key, service.store.get(key)[:50])
-            elif damage == "no file":
-                service.store.delete(key)
-            else:
-                chunk.features_model = None
+            service.store.delete(features_key(chunk.object_key))
     plain, answer = (ask(service, scene_features(1), **params) for params in ({}, {"rerank": 5}))
     assert list(inliers_of(answer)) == list(inliers_of(plain))
     assert (answer["matches"]["compared"], answer["matches"]["missing"]) == (0, PHOTOS)

@@ -53,26 +53,6 @@ def active(service: Service) -> Any:
     return found
 
 
-def test_a_map_is_reduced_by_pca_and_restored(vlad: Service) -> None:
-    whole = active(vlad)
-    assert (whole["dimension"], whole["pca_from"]) == (32, None)
-    result = done(vlad, post(vlad, "/generations", {"pca": 4}))
-    assert (result["dimension"], result["pca"]["rows"]) == (4, PHOTOS)
-    reduced = active(vlad)
-    assert (reduced["dimension"], reduced["pca_from"]) == (4, 32)
-    assert reduced["vocabulary_id"] == whole["vocabulary_id"]
-    about = get(vlad, "/maps/vlad")
-    assert (about["dimension"], about["pca_from"], about["vocabulary"]) == (4, 32, "provisional")
-
-    refused = post(vlad, "/generations", {"pca": 3})
-    body = problem(refused, 409, "already_reduced")
-    assert "placewise maps switch NAME --pca 0" in body["detail"]
-
-    done(vlad, post(vlad, "/generations", {"vocabulary_id": reduced["vocabulary_id"]}))
-    assert active(vlad)["spec"] == whole["spec"]
-    assert get(vlad, "/maps/vlad")["pca_from"] is None
-
-
 def test_an_impossible_pca_is_refused_at_once(vlad: Service) -> None:
     field_refused(post(vlad, "/generations", {"pca": 33}), "pca")
     field_refused(post(vlad, "/generations", {"pca": 0}), "pca")

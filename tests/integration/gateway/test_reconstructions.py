@@ -121,7 +121,6 @@ def test_model_that_makes_no_sense_is_refused(
         assert session.scalar(select(Job).where(Job.kind == JobKind.RECONSTRUCT)) is None
 
 
-@pytest.mark.databases("sqlite", "postgresql")
 def test_components_say_how_they_are_aligned_and_calibrated_or_why_not(
     service: Service, ids: list[UUID]
 ) -> None:

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Generator, Iterator
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 from uuid import UUID
@@ -150,6 +151,30 @@ def test_a_full_redis_takes_events_and_no_messages(
         wait_until(lambda: (heard := listening.get_message()) and heard["type"] == "pmessage")
     client.config_set("maxmemory", "0")
     wait_until(lambda: wakeups.problem is None)
+
+
+def test_ended_jobs_are_reported_with_their_runtime_or_their_error(
+    wakeups: CeleryJobMessages, client: Redis
+) -> None:
+    begun = datetime.now(UTC)
+    times = {"started_at": begun, "finished_at": begun + timedelta(seconds=2)}
+    error = {"code": "undecodable_photo", "detail": "It is cut off."}
+    found: dict[str, dict[str, Any]] = {}
+    with client.pubsub() as listening:  # type: ignore[no-untyped-call]
+        listening.psubscribe("/0.celeryev/*")
+        wait_until(listening.get_message)
+        for state, fields in ((JobState.SUCCEEDED, times), (JobState.FAILED, {"error": error})):
+            wakeups.report(Job(id=new_id(), kind=JobKind.INDEX, state=state, **fields))
+
+        def both() -> bool:
+            heard = listening.get_message()
+            for event in json.loads(_event_text(heard["data"]) or b"[]") if heard else []:
+                found[event["type"]] = event
+            return len(found) == 2
+
+        wait_until(both)
+    assert found["task-succeeded"]["runtime"] == 2.0
+    assert found["task-failed"]["exception"] == "undecodable_photo: It is cut off."
 
 
 def test_closing_in_the_middle_of_a_burst_takes_no_time(

@@ -94,7 +94,7 @@ def test_exported_descriptors_are_the_stored_rows_in_float32(service: Service) -
     generation_id = generation(service)["generation_id"]
     path = f"/generations/{generation_id}/descriptors"
     answer = service("GET", path, params={"map": "half"})
-    assert len(answer.content) == int(answer.headers["content-length"])
+    assert answer.content.endswith(bytes(2 * tarfile.BLOCKSIZE))
     with tarfile.open(fileobj=io.BytesIO(answer.content), mode="r:") as tar:
         file = tar.extractfile("descriptors.npy")
         assert file is not None

@@ -203,13 +203,8 @@ def test_a_cancelled_batch_cancels_its_photos_in_small_transactions(
 def test_retry_queues_the_failed_items_again_whose_bytes_are_there(batches: Batches) -> None:
     batches.store.put("imports/1.jpg", photo_bytes(1))
     manifest = lines({"key": "imports/1.jpg"}, {"key": "imports/2.jpg"})
-    started = batches.service.json(
-        "POST",
-        "/upload/batch",
-        202,
-        content=manifest,
-        headers={"Content-Type": "application/x-ndjson"},
-    )
+    form = {"manifest": ("m.jsonl", manifest)}
+    started = batches.service.json("POST", "/upload/batch", 202, files=form)
     job_id = UUID(started["job_id"])
     problem(batches.service("POST", f"/jobs/{job_id}/retry"), 409, "job_not_retryable")
     assert counts(batches.finish(job_id)) == (1, 2, 1)

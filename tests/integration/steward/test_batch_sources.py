@@ -114,11 +114,9 @@ def test_objects_of_the_store_are_copied_and_stay(batches: Batches) -> None:
         {"key": "imports/day 1/2.jpg"},
         {"key": "imports/nothing.jpg"},
     )
-    for send in (
-        {"content": manifest, "headers": {"Content-Type": "application/x-ndjson"}},
-        {"files": {"manifest": ("m.jsonl", manifest)}},
-    ):
-        started = batches.service.json("POST", "/upload/batch", 202, **send)
+    form = {"manifest": ("m.jsonl", manifest)}
+    for _ in range(2):
+        started = batches.service.json("POST", "/upload/batch", 202, files=form)
         job = batches.finish(UUID(started["job_id"]))
         assert job["state"] == "succeeded"
         assert counts(job) == (2, 3, 1)
@@ -136,12 +134,8 @@ def test_objects_of_the_store_are_copied_and_stay(batches: Batches) -> None:
 @pytest.mark.parametrize("key", ["originals/1", "imports/../originals/1", "imports/", "imports"])
 def test_only_keys_below_imports_are_read(batches: Batches, key: str) -> None:
     manifest = lines({"key": "imports/ok.jpg"}, {"key": key})
-    answer = batches.service(
-        "POST",
-        "/upload/batch",
-        content=manifest,
-        headers={"Content-Type": "application/x-ndjson"},
-    )
+    form = {"manifest": ("m.jsonl", manifest)}
+    answer = batches.service("POST", "/upload/batch", files=form)
     body = problem(answer, 400, "bad_manifest")
     assert [error["line"] for error in body["errors"]] == [2]
     assert "not below imports/" in body["detail"]
@@ -212,8 +206,7 @@ def test_limits_of_a_batch_are_reported_and_leave_nothing(
     assert refused(files=tiny) == "too_many_photos"
     assert refused(files=tiny, headers={"Content-Length": "20000000000"}) == "batch_too_large"
     keys = lines(*({"key": f"imports/{n}.jpg"} for n in range(11)))
-    headers = {"Content-Type": "application/x-ndjson"}
-    assert refused(content=keys, headers=headers) == "too_many_photos"
+    assert refused(files={"manifest": ("m.jsonl", keys)}) == "too_many_photos"
     problem(service("POST", "/upload/batch?map=nope", content=keys[:20]), 400, "no_file")
 
 

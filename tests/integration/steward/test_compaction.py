@@ -94,15 +94,6 @@ def test_a_row_is_merged_at_most_twice(
     chunk_map.check_rows(photo_ids)
 
 
-def test_small_batches_leave_a_bounded_number_of_chunks(chunk_map: ChunkMap) -> None:
-    photo_ids = []
-    for _ in range(40):
-        photo_ids += sum_of(chunk_map.chunks(1))
-        chunk_map.merge(2)
-        assert len(chunk_map.live()) < 4 * 2 + 2
-    chunk_map.check_rows(photo_ids)
-
-
 def test_rows_of_deleted_photos_are_dropped(chunk_map: ChunkMap) -> None:
     first, second = chunk_map.chunks(5, 5)
     chunk_map.delete(first[0])
@@ -150,15 +141,6 @@ def test_damaged_local_features_are_dropped_and_the_rows_are_merged(
     assert chunk_map.merge_all()
     assert chunk_map.features() == ("xfeat@1", [b"", b"", b"3", b"4"])
     chunk_map.check_rows(photo_ids)
-
-
-def test_a_chunk_of_deleted_photos_is_dropped(chunk_map: ChunkMap) -> None:
-    (photo_ids,) = chunk_map.chunks(3)
-    chunk_map.delete(*photo_ids)
-    assert chunk_map.merge() == 1
-    assert chunk_map.live() == []
-    chunk_map.check_rows([])
-    assert chunk_map.merge() == 0
 
 
 def test_rows_that_no_photo_ever_had_are_dropped(chunk_map: ChunkMap) -> None:

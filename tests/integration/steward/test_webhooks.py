@@ -415,7 +415,6 @@ def test_over_https_only_the_named_host_gets_deliveries(
             assert "certificate verify failed" in delivery["last_error"].lower()
 
 
-@BOTH_DATABASES
 def test_a_switched_generation_is_delivered_and_its_photos_are_not(
     hooks: WebhookSetup, vlads: Harness
 ) -> None:
@@ -434,7 +433,6 @@ def test_a_switched_generation_is_delivered_and_its_photos_are_not(
     assert body["generation.switched"]["replaced_generation_id"] == str(before)
 
 
-@BOTH_DATABASES
 def test_a_deleted_webhook_gets_nothing_more(hooks: WebhookSetup) -> None:
     hooks.photo()
     deleted = hooks.door(ADMIN, "DELETE", f"/webhooks/{hooks.webhook['id']}")

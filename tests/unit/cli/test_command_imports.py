@@ -35,24 +35,19 @@ def printed_after(*arguments: str, code: str) -> str:
 def test_the_help_of_the_program_imports_no_command_and_names_each_as_the_command_does() -> None:
     own = "print(*[name for name in sys.modules if name.startswith('services.cli.')])"
     overview, imported = printed_after("--help", code=own).rstrip("\n").rsplit("\n", 1)
-    assert imported == "services.cli.main services.cli.help_layout"
+    assert imported == "services.cli.main"
     complete = CliRunner().invoke(build_app(), ["--help"], prog_name="placewise")
     assert overview.split() == complete.output.split()
 
 
-def test_no_command_imports_a_database_a_server_or_torch_before_it_runs() -> None:
+def test_no_command_but_storage_imports_a_database_a_server_or_torch_before_it_runs() -> None:
     imported = printed_by(
         "import sys\n"
-        "from services.cli.main import build_app\n"
-        "build_app()\n"
+        "from services.cli.main import COMMANDS, build_app\n"
+        "build_app(COMMANDS.keys() - {'storage'})\n"
         f"print(*[name for name in {HEAVY!r} if name in sys.modules])"
     )
     assert imported.split() == []
-
-
-def test_imported_modules_are_frozen_for_the_garbage_collector() -> None:
-    frozen = "print(gc.get_freeze_count() > 10_000, gc.isenabled())"
-    assert printed_after("maps", "--help", code=frozen).endswith("True True\n")
 
 
 def test_the_version_is_printed_without_importing_a_command() -> None:

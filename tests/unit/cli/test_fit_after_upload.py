@@ -20,7 +20,7 @@ def wait(
     *answers: Any, photos: int = 50, next_fit: int | None = 50
 ) -> tuple[Job | None, list[str]]:
     """The job of the fit on a server with this map; the methods of the requests."""
-    with running_server() as server, Client(server.url) as client:
+    with running_server() as server, Client(server.url, patience_seconds=0) as client:
         for answer in ({**STATS, "total_images": photos, "next_fit_photos": next_fit}, *answers):
             server.will_answer(200, answer)
         job = wait_for_automatic_fit(client, Progress(disable=True))

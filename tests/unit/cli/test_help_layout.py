@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import Any
 
 import pytest
 import typer
-from rich.table import Table
 
 from services.cli.main import build_app
 
@@ -21,33 +19,18 @@ def walk(command: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...],
         yield path, command
 
 
-def description_columns(panel: str) -> int:
-    """Return the width of a panel's last column: from where its wrapped lines begin."""
-    rows = [line[1:-1] for line in panel.splitlines() if line.startswith("│")]
-    wrapped = [len(row) - len(row.lstrip()) for row in rows if row.startswith(" " * 8)]
-    return 78 - max(wrapped, default=0)
-
-
-def test_the_help_of_every_command_names_all_options_in_full_and_fills_its_lines(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_the_help_of_every_command_names_all_options_in_full_in_80_columns(
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("typer.rich_utils.Table", Table)
-    monkeypatch.setattr("typer.rich_utils.MAX_WIDTH", 80)
     program: Any = typer.main.get_command(build_app())
     for path, command in walk(program, ()):
         program.main([*path, "--help"], standalone_mode=False)
         shown = capsys.readouterr().out
-        assert "…" not in shown, path
+        assert max(map(len, shown.splitlines())) <= 80, path
         for parameter in command.params:
             for name in parameter.opts:
                 assert not name.startswith("--") or name in shown, (path, name)
                 assert "_" not in name or not name.startswith("--"), (path, name)
-        for panel in shown.split("╭")[1:]:
-            assert description_columns(panel) >= 36, (path, panel)
-        text = "\n".join(map(str.rstrip, shown.splitlines()))
-        for paragraph in text.partition("╭")[0].strip().split("\n\n")[1:]:
-            for line, following in pairwise(paragraph.splitlines()):
-                assert len(line) + 1 + len(following.split()[0]) > 79, (path, line)
 
 
 def test_options_and_commands_are_accepted_with_hyphens_and_underscores(
@@ -66,5 +49,5 @@ def test_every_command_is_in_a_panel_of_the_overview(capsys: pytest.CaptureFixtu
     program: Any = typer.main.get_command(build_app())
     program.main(["--help"], standalone_mode=False)
     shown = capsys.readouterr().out
-    assert "─ Commands ─" not in shown
-    assert all(f"│ {name} " in shown for name in program.commands)
+    assert "Commands:" not in shown
+    assert all(f"\n  {name} " in shown for name in program.commands)

@@ -17,6 +17,8 @@ from services.cli.main import build_app
 from shared.descriptors import weight_files
 from shared.descriptors.backbones import torchhub as torchhub_module
 from shared.descriptors.backbones.dinov2 import SHAPES
+from tests.support.api_responses import JOB
+from tests.support.fake_server import running_server
 from tests.support.files_server import FilesServer, files_server
 from tests.support.hub import COMMIT, write_hub
 from tests.support.vit import random_weights, save
@@ -97,13 +99,6 @@ def test_list_shows_available_weights_and_how_to_get_missing_ones(
     assert not [w for w in command("list") if w["extractor"].startswith("test-")]
 
 
-def test_table_shows_every_extractor() -> None:
-    result = CliRunner().invoke(build_app(["models"]), ["models", "list"], env={"COLUMNS": "200"})
-    assert result.exit_code == 0, result.output
-    for part in ("efficientnet-lite0-vlad", "18.8 MB", "Apache-2.0", "anyloc-vits14"):
-        assert part in result.output
-
-
 def test_weights_that_the_setting_names_are_listed_where_they_fit(
     caches: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -127,35 +122,6 @@ def test_weights_are_fetched_ahead_of_time(server: FilesServer, vits_weights: by
     count = len(server.requests)
     assert command("fetch", VITS) == fetched
     assert len(server.requests) == count, "a file that is present is not requested again"
-
-
-def test_a_downloaded_file_with_a_wrong_hash_is_refused(
-    server: FilesServer, caches: Path, vits_weights: bytes
-) -> None:
-    server.promised[VITS_FILE] = vits_weights
-    server.files[VITS_FILE] = vits_weights[:-4] + b"\0\0\0\0"
-    refused = command("fetch", VITS, exit_code=1)
-    assert refused["code"] == "download_corrupt"
-    retained = [p for p in (caches / "huggingface").rglob("*") if p.is_file()]
-    assert [p for p in retained if p.stat().st_size > 0] == []
-    assert not listed("anyloc-vits14")["available"]
-
-
-def test_weights_of_another_network_are_refused_when_they_are_fetched(
-    server: FilesServer, caches: Path
-) -> None:
-    wide = {"cls_token": torch.zeros(1, 1, 768)}
-    server.files[VITS_FILE] = save(wide, caches / "wide.safetensors").read_bytes()
-    refused = command("fetch", VITS, exit_code=1)
-    assert refused["code"] == "weights_unusable"
-    assert "vitb14" in refused["detail"]
-
-
-def test_what_can_not_be_fetched_is_an_error_with_the_three_ways(
-    server: FilesServer,
-) -> None:
-    server.files.clear()
-    assert "Three ways to get the weights" in command("fetch", VITS, exit_code=1)["detail"]
 
 
 # --- fetch: torch.hub ------------------------------------------------------------------------
@@ -194,21 +160,6 @@ def test_weights_of_an_entry_are_downloaded_resumably(server: FilesServer, cache
     assert (caches / "torch" / "hub" / "checkpoints" / "weights.pth").exists()
 
 
-def test_weights_with_another_hash_than_the_entry_names_are_refused(
-    server: FilesServer, caches: Path
-) -> None:
-    file = save({"projection": torch.zeros(192, 24)}, caches / "weights.pth")
-    server.files["/weights-01234567.pth"] = file.read_bytes()
-    folder = write_hub(caches / "hub")
-    hubconf = folder / "hubconf.py"
-    named = hubconf.read_text().replace(
-        "http://127.0.0.1:9/weights", f"{server.url}/weights-01234567"
-    )
-    hubconf.write_text(named)
-    refused = command("fetch", f"torchhub:{folder}:from_network:check_hash=true", exit_code=1)
-    assert refused["code"] == "download_corrupt"
-
-
 @pytest.mark.parametrize("packed", ["of another commit", "no archive"])
 def test_an_archive_of_something_else_is_refused(
     server: FilesServer, caches: Path, packed: str
@@ -231,3 +182,27 @@ def test_fetch_prints_the_setting_that_allows_the_code(caches: Path) -> None:
 def test_an_extractor_for_tests_has_nothing_to_fetch() -> None:
     assert command("fetch", "test-tiny-avg", exit_code=1)["code"] == "no_weights"
     assert command("fetch", "anyloc", exit_code=1)["code"] == "unknown_extractor"
+
+
+def test_a_checkpoint_is_uploaded_under_the_name_of_its_file(tmp_path: Path) -> None:
+    checkpoint = tmp_path / "best.ckpt"
+    checkpoint.write_bytes(b"w" * 300_000)
+    made = {"extractor": "gsv:lab", "dimension": 512, "size_bytes": 1, "fingerprint": "f" * 64}
+    with running_server() as gateway:
+        gateway.will_answer(200, {"models": []})
+        started = {
+            "job_id": JOB["job_id"],
+            "status": "queued",
+            "status_url": "",
+            "result_url": None,
+        }
+        gateway.will_answer(202, started)
+        ended = {**JOB, "state": "succeeded", "result": {**made, "already_there": False}}
+        gateway.will_answer(200, ended)
+        arguments = ["models", "add", str(checkpoint), "--name", "lab", "--server", gateway.url]
+        result = CliRunner().invoke(build_app(["models"]), arguments)
+    assert result.exit_code == 0, result.output
+    assert "gsv:lab: 512 dimensions" in result.stdout
+    body = gateway.requests[1][2]
+    assert checkpoint.read_bytes() in body
+    assert b'filename="best.ckpt"' in body

@@ -99,14 +99,6 @@ def test_each_level_has_its_probability_and_a_bar_within_80_columns(tmp_path: Pa
     assert max(map(len, tables)) <= 80
 
 
-def test_a_long_label_leaves_room_for_the_probability_and_the_bar(tmp_path: Path) -> None:
-    level = {"place": "building/" + 12 * "corridor ", "probability": 0.5}
-    shown, _ = query(tmp_path, estimate([level]))
-    rows = [row for row in shown.splitlines() if "50.0 %" in row and not row.endswith(".")]
-    assert len(rows[0]) <= 80
-    assert bars(shown)[-2:] == [10, 0]
-
-
 def test_circles_are_named_by_their_radius_with_the_radii_of_68_and_95_percent(
     tmp_path: Path,
 ) -> None:

@@ -87,14 +87,6 @@ def test_a_name_beside_many_columns_keeps_its_ends_and_the_other_columns_their_n
     assert "+fit  56.7  73.3  76.7  86.7  37.5 to 77.8  222.4  57,344  +16.7" in row
 
 
-@pytest.mark.usefixtures("terminal")
-def test_names_that_fit_are_shown_in_full(capsys: pytest.CaptureFixture[str]) -> None:
-    table = Table("photo", "place")
-    table.add_row("queries/frame_000123.jpg", "tower/floor7/elevator")
-    print_table(table)
-    assert "queries/frame_000123.jpg  tower/floor7/elevator" in capsys.readouterr().out
-
-
 def test_output_that_is_no_terminal_is_tab_separated_with_full_names(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

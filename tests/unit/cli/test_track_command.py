@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import sys
 from datetime import UTC, datetime, timedelta
@@ -20,21 +19,15 @@ from PIL.ExifTags import IFD, Base
 from placewise.answers import OneTrack
 from services.cli.track.frame_sources import (
     FrameTiming,
-    Order,
     read_photo_frames,
     read_video_frames,
 )
-from services.cli.track.track_files import (
-    COLUMNS,
-    check_track_files,
-    located_segments,
-    write_track_file,
-)
+from services.cli.track.gpx import GPX_NAMESPACE, located_segments, to_gpx
 from shared.errors import InvalidRequest, Misconfigured
 from tests.support.photos import photo_bytes, photo_image
 
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
-UNKNOWN = FrameTiming(every_seconds=2.0, order=None, begin=None)
+UNKNOWN = FrameTiming(every_seconds=2.0, begin=None)
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -67,11 +60,8 @@ def test_photos_without_a_time_are_in_the_order_of_their_names(tmp_path: Path) -
     frames = read_photo_frames(tmp_path, UNKNOWN)
     assert [frame.name for frame in frames] == ["a.jpg", "b.jpg", "c.jpg"]
     assert [(frame.captured_at - EPOCH).total_seconds() for frame in frames] == [0, 2, 4]
-    later = FrameTiming(1.0, Order.NAME, NOON + timedelta(days=1))
+    later = FrameTiming(1.0, NOON + timedelta(days=1))
     assert read_photo_frames(tmp_path, later)[1].captured_at == NOON + timedelta(days=1, seconds=1)
-    with pytest.raises(InvalidRequest, match=r"a\.jpg has no capture time") as refusal:
-        read_photo_frames(tmp_path, FrameTiming(1.0, Order.TIME, None))
-    assert refusal.value.code == "no_times"
 
 
 def write_video(path: Path, recorded: datetime | None = None) -> Path:
@@ -110,7 +100,7 @@ def test_a_video_has_its_own_clock_which_is_named(
     words: str,
 ) -> None:
     path = write_video(tmp_path / "copied.mp4", recorded)
-    frames = list(read_video_frames(path, FrameTiming(1.0, None, begin), tmp_path))
+    frames = list(read_video_frames(path, FrameTiming(1.0, begin), tmp_path))
     assert [frame.captured_at for frame in frames] == [
         first + timedelta(seconds=seconds) for seconds in range(3)
     ]
@@ -121,7 +111,7 @@ def test_a_video_has_its_own_clock_which_is_named(
 def test_a_video_gives_a_frame_every_so_many_seconds(
     video: Path, tmp_path: Path, every: float, seconds: list[float]
 ) -> None:
-    frames = list(read_video_frames(video, FrameTiming(every, None, NOON), tmp_path))
+    frames = list(read_video_frames(video, FrameTiming(every, NOON), tmp_path))
     assert [(f.captured_at - NOON).total_seconds() for f in frames] == pytest.approx(seconds)
     shades = [np.asarray(Image.open(frame.path)).mean() for frame in frames]
     assert shades == pytest.approx([40, 100, 160], abs=8)
@@ -219,19 +209,9 @@ RIDE = track_of(
 )
 
 
-def test_files_of_a_track_have_its_frames_and_no_line_where_it_is_lost(tmp_path: Path) -> None:
-    names = ("csv", "gpx")
-    files = {name: tmp_path / f"ride.{name}" for name in names}
-    check_track_files(list(files.values()))
-    for file in files.values():
-        write_track_file(file, RIDE)
-    rows = list(csv.DictReader(files["csv"].read_text().splitlines()))
-    assert tuple(rows[0]) == COLUMNS
-    statuses = [row["status"] for row in rows]
-    assert statuses == ["converging", "tracking", "lost", "failed", "tracking"]
-    assert (rows[3]["latitude"], rows[4]["latitude"]) == ("", "45.002")
-    gpx = ElementTree.parse(files["gpx"]).getroot()
-    space = {"g": "http://www.topografix.com/GPX/1/1"}
+def test_a_gpx_track_has_a_segment_for_each_part_that_is_not_lost() -> None:
+    gpx = ElementTree.fromstring(to_gpx(RIDE))
+    space = {"g": GPX_NAMESPACE}
     segments = gpx.findall("g:trk/g:trkseg", space)
     assert [len(segment) for segment in segments] == [2, 1]
     first = segments[0].find("g:trkpt", space)
@@ -239,17 +219,3 @@ def test_files_of_a_track_have_its_frames_and_no_line_where_it_is_lost(tmp_path:
     assert first.attrib == {"lat": "45.0000000", "lon": "7.0000000"}
     assert first.findtext("g:time", namespaces=space) == "2026-05-01T12:00:00Z"
     assert located_segments(track_of(None)) == []
-
-
-def test_csv_cells_are_no_formulas_for_a_spreadsheet(tmp_path: Path) -> None:
-    named = RIDE.frames[0].model_copy(update={"filename": "-1.jpg"})
-    write_track_file(tmp_path / "ride.csv", RIDE.model_copy(update={"frames": [named]}))
-    [row] = csv.DictReader((tmp_path / "ride.csv").read_text().splitlines())
-    assert row["filename"] == "'-1.jpg"
-
-
-def test_files_that_can_not_be_written_are_refused_before_the_work(tmp_path: Path) -> None:
-    for bad in (tmp_path / "ride.txt", tmp_path / "missing" / "ride.csv"):
-        with pytest.raises(InvalidRequest) as refusal:
-            check_track_files([bad])
-        assert refusal.value.code == "bad_out"

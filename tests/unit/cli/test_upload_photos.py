@@ -33,7 +33,7 @@ def test_photos_that_wait_for_a_vocabulary_are_not_waited_for_one_by_one(
     waiting = {**JOB, "state": "queued", "waiting_for": "vocabulary"}
     for answer in (waiting, STATS, NO_JOBS, waiting, STATS):
         server.will_answer(200, answer)
-    with Client(server.url) as client:
+    with Client(server.url, patience_seconds=0) as client:
         report = upload_photos(client, [photo], Progress(disable=True))
     assert report["failed"] == []
     polls = [path for _, path, _ in server.requests if path.startswith("/api/v1/jobs/")]

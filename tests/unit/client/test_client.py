@@ -32,7 +32,7 @@ from tests.support.fake_server import FakeServer
 
 @pytest.fixture
 def client(server: FakeServer) -> Iterator[Client]:
-    with Client(server.url) as made:
+    with Client(server.url, patience_seconds=0) as made:
         yield made
 
 
@@ -114,7 +114,7 @@ def test_file_that_cannot_be_read_is_an_error_before_anything_is_sent(
 def test_map_is_named_in_every_call(server: FakeServer) -> None:
     server.will_answer(200, STATS)
     server.will_answer(200, {"images": [], "next_cursor": None})
-    with Client(server.url + "/", map_name="lab") as client:
+    with Client(server.url + "/", map="lab", patience_seconds=0) as client:
         client.stats()
         assert list(client.photos(filename="a b")) == []
     assert server.requests[0][1] == "/api/v1/database/stats?map=lab"
@@ -230,7 +230,7 @@ def test_retry_after_is_obeyed_however_long(server: FakeServer, slept: list[floa
     for seconds in (30, 60, 4000):
         refuse(server, TooManyRequests("queue_full", "Full.", retry_after_seconds=seconds))
     server.will_answer(200, STATS)
-    with Client(server.url) as client:
+    with Client(server.url, patience_seconds=0) as client:
         patient = client.with_patience(1, lambda error, seconds: seen.append((error.code, seconds)))
         assert patient.stats().as_json() == STATS
     assert slept == [30, 60, 300]
@@ -279,7 +279,7 @@ def test_a_direct_upload_announces_sends_and_completes(
     server.will_answer(503, b"<Error><Code>SlowDown</Code></Error>")
     server.will_answer(200, b"")
     server.will_answer(202, UPLOADED)
-    with Client(server.url, map_name="lab", key="secret", patience_seconds=60) as client:
+    with Client(server.url, map="lab", key="secret", patience_seconds=60) as client:
         assert client.upload_direct(photo, latitude=45.5, place=None).as_json() == UPLOADED
     announced, *sent, completed = server.requests
     assert announced[1] == "/api/v1/uploads/presign?map=lab"

@@ -111,22 +111,17 @@ def test_keys_are_created_with_the_limits_that_are_given(server: FakeServer) -> 
     assert (created.key, created.requests_per_minute) == ("pw_1secret", 60)
 
 
-def test_a_model_is_sent_with_its_name_and_the_progress_is_reported(
-    server: FakeServer, tmp_path: Path
-) -> None:
+def test_a_model_is_sent_with_its_name(server: FakeServer, tmp_path: Path) -> None:
     checkpoint = tmp_path / "best.ckpt"
     checkpoint.write_bytes(b"w" * 300_000)
     server.will_answer(202, STARTED)
-    sent: list[int] = []
     with placewise.connect(server.url) as places:
-        places.add_model(checkpoint, "lab", licence="MIT", on_sent=sent.append)
+        places.add_model(checkpoint, "lab", licence="MIT")
     method, path, body = server.requests[0]
     assert (method, path) == ("POST", "/api/v1/models")
     assert b'name="licence"' in body
     assert b'name="note"' not in body
     assert checkpoint.read_bytes() in body
-    assert sent == sorted(sent)
-    assert sent[-1] == 300_000
 
 
 def test_answers_serialise_to_the_json_that_the_server_sent(server: FakeServer) -> None:

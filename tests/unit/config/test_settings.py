@@ -221,25 +221,6 @@ def test_extractor_of_new_maps_has_its_canonical_name(
 
 
 @pytest.mark.usefixtures("production")
-def test_extractors_for_tests_are_refused_where_they_are_not_allowed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    assert "ALLOW_TEST_EXTRACTORS" in refusal(monkeypatch, EXTRACTOR="test-tiny-avg")
-
-
-@pytest.mark.usefixtures("production")
-def test_name_and_options_of_the_extractor_are_checked_at_the_start(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    unknown = refusal(monkeypatch, EXTRACTOR="anylock-vitg14")
-    assert unknown.startswith("EXTRACTOR=anylock-vitg14: ")
-    assert "anyloc-vitg14" in unknown
-    message = refusal(monkeypatch, EXTRACTOR="anyloc-vitb14:layer=12")
-    assert "layer=12" in message
-    assert "0 to 11" in message
-
-
-@pytest.mark.usefixtures("production")
 @pytest.mark.parametrize("model", ["vitg14", "dinov2_vitg14_reg"])
 def test_an_unknown_dino_model_is_refused_with_the_known_ones(
     monkeypatch: pytest.MonkeyPatch, model: str
@@ -392,13 +373,6 @@ def test_rows_that_milvus_can_not_hold_are_refused_with_what_helps() -> None:
     with pytest.raises(Conflict, match="placewise maps switch NAME --pca 8192") as refused:
         on_milvus.check_row_length(98_304)
     assert (refused.value.code, refused.value.extra) == ("rows_too_long", {"dimension": 98_304})
-
-
-@pytest.mark.parametrize(
-    "uri", ["http://milvus:19530", "https://user:secret@host:1", "https://token@host", "some.db"]
-)
-def test_a_milvus_uri_may_have_a_login(uri: str) -> None:
-    assert Settings(milvus_uri=SecretStr(uri)).milvus_uri == SecretStr(uri)
 
 
 def test_a_milvus_uri_that_is_none_is_refused_without_repeating_its_secret() -> None:

@@ -76,13 +76,6 @@ def test_dimension_follows_the_clusters_of_vlad_only() -> None:
     assert EXTRACTOR_CONFIGS["test-tiny-avg"].dimension == 16
 
 
-def test_options_are_taken() -> None:
-    found = config("anyloc-vitb14:layer=9,facet=key,clusters=32")
-    assert (found.layer, found.facet, found.clusters) == (9, "key", 32)
-    assert found.dimension == 32 * 768
-    assert found.backbone == "dinov2-vitb14"
-
-
 @pytest.mark.parametrize(
     ("written", "canonical"),
     [
@@ -145,28 +138,6 @@ def test_bad_options_are_named_with_what_is_allowed(name: str, fields: list[str]
     assert name.partition(":")[0] in detail
     for words in fields:
         assert words in detail
-
-
-def test_an_extractor_without_a_vocabulary_has_no_clusters() -> None:
-    with pytest.raises(Misconfigured, match=r"no option 'clusters'.*It has none"):
-        get_extractor_config("test-tiny-avg:clusters=3", allow_test_extractors=True)
-
-
-def test_slow_extractor_takes_its_time_and_width_from_its_name() -> None:
-    found = get_extractor_config(
-        "test-slow-avg:width=98304,milliseconds=500", allow_test_extractors=True
-    )
-    assert found.name == "test-slow-avg:milliseconds=500,width=98304"
-    assert (found.milliseconds, found.dimension) == (500, 98_304)
-    for other in ("test-slow-avg", "test-slow-avg:width=98304", "test-slow-avg:milliseconds=500"):
-        config = get_extractor_config(other, allow_test_extractors=True)
-        assert config.backbone_key != found.backbone_key
-
-
-@pytest.mark.parametrize("option", ["width=15", "width=131073", "milliseconds=60001"])
-def test_slow_extractor_says_what_it_can_do(option: str) -> None:
-    with pytest.raises(Misconfigured, match="a whole number from"):
-        get_extractor_config(f"test-slow-avg:{option}", allow_test_extractors=True)
 
 
 def test_shipped_vocabulary_begins_a_map_whatever_number_later_fits_make() -> None:

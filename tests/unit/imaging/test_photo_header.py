@@ -92,23 +92,6 @@ def reason(data: bytes, max_pixels: int = PIXELS) -> Unprocessable:
 
 
 @pytest.mark.parametrize(
-    ("north", "east", "latitude", "longitude"),
-    [
-        ("N", "E", 45.07, 7.51),
-        ("N", "W", 45.07, -7.51),
-        ("S", "E", -45.07, 7.51),
-        ("S", "W", -45.07, -7.51),
-    ],
-)
-def test_gps_position_is_read_in_all_four_hemispheres(
-    north: str, east: str, latitude: float, longitude: float
-) -> None:
-    found = header(encoded(exif=exif_with(position(north, east))))
-    assert found.latitude == pytest.approx(latitude, abs=1e-9)
-    assert found.longitude == pytest.approx(longitude, abs=1e-9)
-
-
-@pytest.mark.parametrize(
     "broken",
     [
         {GPS.GPSLatitude: (91.0, 0.0, 0.0)},
@@ -190,32 +173,6 @@ CAMERA_TIME: Tags = {
 
 
 @pytest.mark.parametrize(
-    ("gps", "camera", "expected"),
-    [
-        (
-            GPS_TIME,
-            {Base.DateTimeOriginal: "2020:01:01 00:00:00"},
-            datetime(2024, 5, 6, 10, 20, 30, 500_000, tzinfo=UTC),
-        ),
-        (None, CAMERA_TIME, datetime(2024, 5, 6, 10, 20, 31, tzinfo=UTC)),
-        (
-            None,
-            {Base.DateTimeOriginal: "2024:05:06 12:20:31"},
-            datetime(2024, 5, 6, 12, 20, 31, tzinfo=UTC),
-        ),
-    ],
-    ids=["GPS before the camera's", "camera's with its offset", "camera's counts as UTC"],
-)
-def test_capture_time_is_the_gps_time_or_the_camera_time_in_utc(
-    gps: Tags | None, camera: Tags, expected: datetime
-) -> None:
-    found = taken(gps, camera)
-    assert found == expected
-    assert found is not None
-    assert found.utcoffset() == UTC.utcoffset(None)
-
-
-@pytest.mark.parametrize(
     "gps",
     [
         {GPS.GPSDateStamp: "2024:05:06"},
@@ -226,18 +183,6 @@ def test_capture_time_is_the_gps_time_or_the_camera_time_in_utc(
 )
 def test_camera_time_is_used_where_the_gps_time_is_invalid(gps: Tags) -> None:
     assert taken(gps, CAMERA_TIME) == datetime(2024, 5, 6, 10, 20, 31, tzinfo=UTC)
-
-
-@pytest.mark.parametrize(
-    "camera",
-    [
-        {Base.DateTimeOriginal: "0000:00:00 00:00:00"},
-        {Base.DateTimeOriginal: "a long time ago"},
-        {Base.DateTimeOriginal: "0001:01:01 00:00:00", Base.OffsetTimeOriginal: "+05:00"},
-    ],
-)
-def test_invalid_camera_time_is_ignored(camera: Tags) -> None:
-    assert taken(None, camera) is None
 
 
 @pytest.mark.parametrize(
@@ -333,15 +278,6 @@ def png_without_pixels(width: int, height: int, *between: bytes) -> bytes:
     """A PNG whose pixels are missing: only a reader of headers can make sense of it."""
     size = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", size) + b"".join(between)
-
-
-def test_exif_of_a_png_is_read_before_and_behind_the_pixels() -> None:
-    exif, pixels = whole_exif().removeprefix(b"Exif\0\0"), chunk(b"IDAT", b"no pixels at all")
-    for chunks in ((chunk(b"eXIf", exif), pixels), (pixels, chunk(b"eXIf", exif))):
-        found = header(png_without_pixels(30, 20, *chunks, chunk(b"IEND", b"")))
-        assert (found.width, found.height) == (20, 30)
-        assert found.latitude == pytest.approx(45.07)
-        assert found.captured_at == datetime(2024, 5, 6, 10, 20, 30, 500_000, tzinfo=UTC)
 
 
 def test_png_whose_end_is_not_reached_may_have_coordinates() -> None:

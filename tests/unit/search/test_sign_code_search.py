@@ -17,7 +17,7 @@ from services.search.snapshot import Snapshot
 from shared.codes.sign_codes import encode_signs
 from shared.ids import new_id
 from shared.search_api.protocol import SearchResponse
-from tests.support.servers.handle import wait_until
+from tests.support.waiting import wait_until
 from tests.unit.search.search_rows import (
     Case,
     answer,
@@ -121,7 +121,7 @@ def test_queries_that_come_together_get_the_answers_that_they_get_alone(
 
     def first_waits(*arguments: Any) -> Any:
         if glances.batches_run == 1:
-            wait_until(lambda: glances.queue_length == 23, 30, lambda: None, "23 other queries")
+            wait_until(lambda: glances.queue_length == 23)
         return scan_first_level(*arguments)
 
     monkeypatch.setattr(sign_code_search, "scan_first_level", first_waits)

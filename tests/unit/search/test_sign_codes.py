@@ -87,9 +87,7 @@ def test_rows_of_another_length_or_type_are_no_rows_of_the_rotation() -> None:
         "noise",
         "one cluster",
         "1 strong numbers",
-        "2 strong numbers",
         "4 strong numbers",
-        "64 strong numbers",
     ],
 )
 def test_estimates_err_as_the_theory_says_whatever_the_rows(kind: str) -> None:

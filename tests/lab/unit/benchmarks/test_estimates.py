@@ -14,18 +14,11 @@ from typer.testing import CliRunner
 from lab.benchmarks import estimates
 from lab.benchmarks.estimates import (
     DescribedPhotos,
-    add_judged,
-    add_left_out,
-    draw,
-    fit_and_judge,
-    left_out_labels,
 )
-from lab.benchmarks.report import Report
 from services.cli.main import build_app
 from shared.errors import Misconfigured
 from shared.evaluation.places.evidence import PhotoLocation
 from shared.evaluation.places.levels import LevelScheme
-from shared.evaluation.places.probability import MIN_LABELLED_QUERIES
 
 PLACES, PER_PLACE, FLOORS = 24, 6, 8
 
@@ -46,29 +39,6 @@ def described(per_place: int = PER_PLACE) -> DescribedPhotos:
         LevelScheme(labels_are_paths=True, radii_m=(25.0,)),
         25.0,
     )
-
-
-def test_queries_of_clear_places_are_answered_rightly() -> None:
-    photos = described()
-    judged = fit_and_judge(photos, ~photos.is_query, photos.is_query)
-    assert len(judged) == PLACES
-    report = Report("estimates")
-    add_judged(report, "house", judged)
-    measured = {figure.what: figure.measured for figure in report.figures}
-    assert measured["house: answered"] > 80
-    assert measured["house: right"] == 100
-    assert measured["house: ECE of level 0"] < 0.2
-
-
-def test_labelled_queries_calibrate_the_estimates_of_the_others() -> None:
-    photos = described()
-    labelled = draw(np.arange(len(photos.rows)) % PER_PLACE > 3, MIN_LABELLED_QUERIES, seed=0)
-    assert labelled.sum() == MIN_LABELLED_QUERIES
-    in_map = ~photos.is_query & ~labelled
-    judged = fit_and_judge(photos, in_map, photos.is_query, labelled)
-    assert [j.cluster for j in judged] == list(range(PLACES))
-    without = fit_and_judge(photos, in_map, photos.is_query)
-    assert judged[0].estimate.probabilities != without[0].estimate.probabilities
 
 
 def with_foreign(photos: DescribedPhotos, count: int = 20) -> DescribedPhotos:
@@ -107,14 +77,3 @@ def test_without_a_folder_the_tower_of_the_test_data_is_measured(
     monkeypatch.delenv("PLACEWISE_TEST_DATA")
     with pytest.raises(Misconfigured, match="PLACEWISE_TEST_DATA"):
         estimates.bench()
-
-
-def test_each_floor_is_left_out_once_and_its_photos_get_few_fine_answers() -> None:
-    photos = described()
-    groups = list(left_out_labels(photos))
-    assert np.sum(groups, axis=0).tolist() == [1] * len(photos.rows)
-    report = Report("estimates")
-    add_left_out(report, "house", photos)
-    finest, wrong = (figure.measured for figure in report.figures)
-    assert finest <= 20
-    assert wrong >= finest, "none of these answers can be right"

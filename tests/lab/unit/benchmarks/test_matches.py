@@ -57,13 +57,3 @@ def test_matches_find_the_places_that_descriptors_confuse_at_a_cost_that_is_repo
     assert measured["house: CPU a photo"] == 10
     assert measured["house: bytes a photo"] == 16 + 40 * 68
     assert 0 < measured["house: CPU a pair, matching alone"] < measured["house: CPU a pair"]
-
-
-def test_each_pair_is_matched_once() -> None:
-    matched = MatchedPhotos(features().__getitem__, MutualNearest.of_model(MODEL))
-    same, other = matched.match(1, [0, 4])
-    assert same is not None
-    assert other is not None
-    assert same > 10 * max(other, 1.0)
-    assert matched.match(0, [1]) == [same]
-    assert len(matched.supports) == 2

@@ -7,11 +7,8 @@ import pytest
 
 from lab.benchmarks.pose import (
     MappedPhotos,
-    Vlad,
     _align,
-    _covered,
     _judge,
-    _second,
     measure_synthetic,
 )
 from lab.benchmarks.report import Report
@@ -48,22 +45,6 @@ def test_photos_of_a_scene_are_mapped_aligned_and_judged(scene: ReconstructedSce
     assert len(mapped.pose_seconds) == PHOTOS
 
 
-def test_vlad_ranks_photos_of_the_same_points_first(scene: ReconstructedScene) -> None:
-    other = ReconstructedScene(photos=PHOTOS, seed=1)
-    vlad = Vlad([*scene.features.values(), *other.features.values()])
-    ranked = np.argsort(-vlad.rows @ vlad.describe(next(iter(other.features.values()))))
-    assert ranked[0] == PHOTOS
-    assert set(ranked[:PHOTOS].tolist()) == set(range(PHOTOS, 2 * PHOTOS))
-
-
-def test_covered_photo_shows_two_scenes(scene: ReconstructedScene) -> None:
-    one, other = list(scene.features.values())[:2]
-    both = _covered(one, other)
-    left = both.positions[:, 0] < 0.6 * 65535
-    assert left.sum() == (one.positions[:, 0] < 0.6 * 65535).sum()
-    assert (~left).sum() == (other.positions[:, 0] >= 0.6 * 65535).sum()
-
-
 def test_poses_of_synthetic_scenes_are_within_their_covariance(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -73,13 +54,6 @@ def test_poses_of_synthetic_scenes_are_within_their_covariance(
     measured = {figure.what: figure.measured for figure in report.figures}
     assert measured["synthetic scenes: within 3 deviations"] > 93
     assert 50 < measured["synthetic scenes: within 68 %, not too many"] < 86
-
-
-def test_walks_of_a_building_are_an_hour_apart() -> None:
-    from pathlib import Path
-
-    paths = [Path(f"floor3__{walk}_frame_{n:06}.jpg") for walk in ("a", "b") for n in (1, 2)]
-    assert [_second(path, paths) for path in paths] == [1, 2, 3601, 3602]
 
 
 def test_round_trip_closes_and_its_queries_are_on_the_same_streets() -> None:

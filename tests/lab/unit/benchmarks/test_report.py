@@ -6,13 +6,8 @@ import contextlib
 
 import pytest
 import typer
-from typer.testing import CliRunner
 
-from lab.benchmarks.report import LatencySummary, Report, printed_report
-from services.cli.main import build_app
-
-runner = CliRunner()
-app = build_app(["bench"])
+from lab.benchmarks.report import Report, printed_report
 
 
 @pytest.mark.parametrize(
@@ -37,13 +32,3 @@ def test_missed_figure_is_exit_code_1(capsys: pytest.CaptureFixture[str], missed
     with ended, printed_report("anything", as_json=False) as (report, _):
         report.add("requests failed", int(missed), at_most=0)
     assert ("missed" in capsys.readouterr().out) == missed
-
-
-@pytest.mark.parametrize("widths", ["1,x", "0,1"])
-def test_numbers_that_are_none_are_refused(widths: str) -> None:
-    assert runner.invoke(app, ["bench", "pipeline", "--widths", widths]).exit_code == 2
-
-
-def test_spread_is_of_the_slowest_too() -> None:
-    found = LatencySummary.of([float(number) for number in range(100, 0, -1)])
-    assert (found.median, found.p95, found.worst) == (50.5, 96.0, 100.0)

@@ -7,7 +7,6 @@ from pathlib import Path
 from uuid import UUID
 
 import numpy as np
-import pytest
 from rich.progress import Progress
 from typer.testing import CliRunner
 
@@ -15,16 +14,13 @@ from lab.benchmarks.report import Report
 from lab.benchmarks.search import (
     MATCHED_CASE,
     PLACEWISE,
-    BruteForce,
     Ranking,
     SearchMethod,
     compare_methods,
-    measure_growth,
     placewise_search,
     same_ranking,
 )
 from lab.benchmarks.synthetic_map import (
-    BLOCKS,
     SyntheticCity,
     create_synthetic_map,
     required_memory_bytes,
@@ -32,51 +28,9 @@ from lab.benchmarks.synthetic_map import (
 from services.cli.main import build_app
 from services.search.snapshot import Snapshot
 from services.search.worker import SearchWorker
-from shared.storage.chunks import Row, Rows
+from shared.storage.chunks import Row
 
 IDS = [UUID(int=number + 1) for number in range(6)]
-
-
-def rows_of(seed: int, count: int, dimension: int = 64) -> Rows:
-    rows = np.random.default_rng(seed).standard_normal((count, dimension))
-    found: Rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
-    return found
-
-
-def test_descriptors_have_the_structure_of_vlad() -> None:
-    city = SyntheticCity(7168, seed=3)
-    rows = np.concatenate(list(city.chunks(1300, 500)))
-    assert rows.shape == (1300, 7168)
-    np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1, atol=1e-6)
-    lengths = np.linalg.norm(rows.reshape(-1, BLOCKS, 112), axis=2)
-    words = (lengths > 0).sum(axis=1)
-    assert 42 < np.median(words) < 50
-    assert words.max() > words.min() + 10
-    np.testing.assert_allclose(lengths.max(axis=1) ** 2 * words, 1, atol=1e-4)
-    strangers = rows[:250] @ rows[500:750].T
-    assert 0.07 < strangers.mean() < 0.12
-    assert 0.02 < strangers.std() < 0.05
-    best = -np.sort(-(city.revisits(1300, 30) @ rows.T), axis=1)
-    assert 0.5 < np.median(best[:, 0]) < 0.7
-    assert 0.3 < np.median(best[:, 9]) < 0.55
-    best = -np.sort(-(city.out_of_map_rows(20) @ rows.T), axis=1)
-    assert best[:, 9].max() < 0.25
-
-
-def test_the_same_seed_makes_the_same_city_whatever_the_chunks() -> None:
-    one = np.concatenate(list(SyntheticCity(512, 1).chunks(600, 100)))
-    other = np.concatenate(list(SyntheticCity(512, 1).chunks(600, 1000)))
-    np.testing.assert_array_equal(one, other)
-    assert not np.array_equal(one, np.concatenate(list(SyntheticCity(512, 2).chunks(600, 1000))))
-
-
-def test_brute_force_orders_equal_photos_by_their_ids() -> None:
-    rows = rows_of(1, 6)
-    rows[4] = rows[1]
-    oracle = BruteForce((rows[:4], rows[4:]), IDS, rows[1:2] * np.float32(3))
-    best = oracle.best(0, 2)
-    assert [photo_id for photo_id, _ in best] == [IDS[1], IDS[4]]
-    assert best[0][1] == pytest.approx(1, abs=1e-6)
 
 
 def test_another_order_another_photo_another_score_and_a_missing_one_are_no_right_answers() -> None:
@@ -111,14 +65,6 @@ def test_whole_run_finds_no_wrong_answer_and_measures_everything(tmp_path: Path)
     assert len(comparison["rows"]) == 4 * 5
     assert not any(row["wrong"] for row in comparison["rows"])
     assert not list(tmp_path.iterdir()), "what was made is removed"
-
-
-def test_growth_is_measured_by_the_size_of_the_map() -> None:
-    report = Report("anything")
-    with Progress(disable=True) as progress:
-        measure_growth(report, progress, sizes=[3000])
-    figures = {figure.what: figure.measured for figure in report.figures}
-    assert figures["growth: scan of 3,000 codes, p50"] > 0
 
 
 def test_a_wrong_answer_of_ours_is_a_missed_figure(tmp_path: Path) -> None:

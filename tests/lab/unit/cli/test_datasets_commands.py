@@ -154,13 +154,3 @@ def test_ground_truth_by_another_rule_and_what_it_refuses(tmp_path: Path) -> Non
     assert run_datasets(*lists, out, "--radius", "inf", code=1)["code"] == "unknown_rule"
     missing = tmp_path / "nowhere" / "gt.npy"
     assert run_datasets(*lists, missing, "--rule", "frames 2", code=1)["code"] == "out_unwritable"
-
-
-def test_predictions_that_no_data_set_has_are_refused(tmp_path: Path) -> None:
-    street(tmp_path, "database", [0, 60, 1000])
-    street(tmp_path, "queries", [0, 10])
-    options = ("--data", tmp_path, "--predictions", tmp_path / "p.npy")
-    np.save(tmp_path / "p.npy", np.array([[1], [3]]))
-    assert evaluate(*options, code=1)["code"] == "bad_predictions"
-    np.save(tmp_path / "p.npy", np.array([0.5]))
-    assert evaluate(*options, code=1)["code"] == "bad_predictions"

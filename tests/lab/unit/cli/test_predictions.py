@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from lab.datasets.ground_truth_files import write_ground_truth
 from services.cli.main import build_app
 
 TRUTH = [[4, 2], [1], [], [3], [0, 5]]
@@ -101,34 +100,6 @@ def test_lists_give_names_and_metres_to_a_report(tmp_path: Path, files: tuple[Pa
     assert first[4] == "40.11", "metres: 40 to the east and 3 to the south"
     assert first[5] == "true"
     assert "no photo" in (out / "report.html").read_text()
-
-
-def test_prediction_beyond_the_database_is_refused(
-    tmp_path: Path, files: tuple[Path, Path]
-) -> None:
-    np.save(tmp_path / "beyond.npy", np.array([[0], [1], [6], [2], [3]]))
-    problem = run(
-        "--predictions", tmp_path / "beyond.npy", "--ground-truth", files[1], *lists(tmp_path),
-        code=1,
-    )  # fmt: skip
-    assert problem["code"] == "bad_predictions"
-    assert "6 of query 2" in problem["detail"]
-
-
-def test_ground_truth_of_the_same_photos_in_another_order_is_refused(
-    tmp_path: Path, files: tuple[Path, Path]
-) -> None:
-    given = lists(tmp_path)
-    names = np.load(tmp_path / "database.npy").tolist()
-    text = (tmp_path / "queries.txt").read_text().splitlines()
-    positives = [np.array(row, np.int64) for row in TRUTH]
-    write_ground_truth(
-        tmp_path / "own.npy", positives, database=names, queries=text, rule="radius 25 m"
-    )
-    arguments = ["--predictions", files[0], "--ground-truth", tmp_path / "own.npy", *given]
-    assert run(*arguments)["rule"] == "radius 25 m"
-    np.save(tmp_path / "database.npy", np.array(names[::-1]))
-    assert run(*arguments, code=1)["code"] == "ground_truth_of_other_lists"
 
 
 def test_runs_are_compared_query_by_query_where_their_ground_truth_is_the_same(

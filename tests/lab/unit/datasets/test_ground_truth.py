@@ -69,12 +69,6 @@ def test_positives_are_those_of_the_full_matrix(
     assert [row.tolist() for row in found] == by_full_matrix(queries, database, within_m)
 
 
-def test_positive_is_within_25_metres_the_bound_included() -> None:
-    queries = np.array([[0.0, 0.0], [1e9, -1e9]])
-    database = np.array([[25.0, 0.0], [25.01, 0.0], [15.0, 20.0], [18.0, 18.0]])
-    assert [row.tolist() for row in positives_within(queries, database)] == [[0, 2], []]
-
-
 @pytest.mark.parametrize(
     ("text", "rule"),
     [
@@ -165,27 +159,6 @@ def test_frames_rule_counts_frames_and_can_stay_within_a_sequence() -> None:
     assert positives("frames 2", [query], database) == [[0, 1, 2, 4]]
     assert positives("frames 2 in sequence", [query], database) == [[1, 2]]
     assert positives("frames 2 in sequence", [shot(frame=5, sequence="c")], database) == [[]]
-
-
-@given(
-    st.lists(st.integers(0, 30), max_size=20),
-    st.lists(st.integers(0, 30), max_size=20),
-    st.integers(0, 10),
-)
-@settings(deadline=None)
-def test_frames_are_those_of_the_full_matrix(
-    query_positions: list[int], database_positions: list[int], apart: int
-) -> None:
-    found = positives(
-        f"frames {apart}",
-        [shot(frame=f) for f in query_positions],
-        [shot(frame=f) for f in database_positions],
-    )
-    expected = [
-        [i for i, f in enumerate(database_positions) if abs(f - query) <= apart]
-        for query in query_positions
-    ]
-    assert found == expected
 
 
 def test_place_rule_matches_labels_and_a_photo_without_one_matches_none() -> None:

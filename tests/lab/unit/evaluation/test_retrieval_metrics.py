@@ -115,13 +115,6 @@ def test_queries_cluster_by_sequence_then_place_then_square() -> None:
     assert cluster_queries(lost).kind == "queries"
 
 
-def test_squares_by_degrees_separate_as_squares_by_metres() -> None:
-    degrees = [shot(None, latitude=60.0, longitude=10 + n * 0.01) for n in range(MIN_CLUSTERS)]
-    assert cluster_queries(degrees).count == MIN_CLUSTERS
-    beside = [*degrees, shot(None, latitude=60.0, longitude=10.0)]
-    assert cluster_queries(beside).count == MIN_CLUSTERS
-
-
 def test_interval_is_that_of_the_binomial_where_queries_are_independent() -> None:
     values = (np.arange(400) < 100).astype(float)[:, None]
     found = bootstrap_intervals(values, np.arange(400))
@@ -147,15 +140,6 @@ def test_a_share_of_0_or_100_percent_has_the_interval_of_wilson_over_the_cluster
         assert found[1].as_json() == pytest.approx([1 - wilson.high, 1.0], abs=1e-6)
         assert found[2] == bootstrap[2], "others are those of the bootstrap"
     assert share_intervals(values, np.arange(40) % (MIN_CLUSTERS - 1)) is None
-
-
-def test_copies_of_queries_in_their_clusters_make_no_interval_narrower() -> None:
-    values = (np.arange(100) < 40).astype(float)[:, None]
-    once = bootstrap_intervals(values, np.arange(100))
-    copied = bootstrap_intervals(np.repeat(values, 9, axis=0), np.repeat(np.arange(100), 9))
-    assert once is not None
-    assert copied is not None
-    assert copied[0].as_json() == pytest.approx(once[0].as_json())
 
 
 def test_runs_are_compared_query_by_query() -> None:

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from filelock import FileLock
 
 from placewise.protocol import RetryPolicy
 from services.cli.immich import api
@@ -17,6 +18,7 @@ from services.cli.immich.api import ImmichApi
 from services.cli.immich.library import ImmichLibrary
 from services.cli.locate.library import LocatedPhoto
 from shared.errors import (
+    Conflict,
     Forbidden,
     InvalidRequest,
     NotFound,
@@ -217,3 +219,32 @@ def test_the_journal_holds_the_former_values_and_undo_cannot_take_coordinates_aw
     immich.move(empty, None, None)
     with pytest.raises(NotFound):
         found.undo()
+
+
+def test_the_journal_survives_a_kill_is_refused_when_damaged_and_belongs_to_one_process(
+    immich: ImmichServer, tmp_path: Path, waits: list[float]
+) -> None:
+    for number in (1, 2):
+        immich.add(f"{number}.jpg", photo_bytes(number))
+    found = library(immich, tmp_path)
+    first, second = (
+        LocatedPhoto(photo, Proposal(*HERE, 100, 0.99, 20, ""), None, None, None)
+        for photo in found.list_photos()
+    )
+    found.write([first])
+    (journal,) = tmp_path.rglob("*.jsonl")
+    with journal.open("ab") as file:
+        file.write(b'{"id": "a line of a killed proce')
+    found.write([second])
+    intact = journal.read_bytes()
+    assert intact.count(b"\n") == 2
+    journal.write_bytes(b"{}\n" + intact)
+    with pytest.raises(Unprocessable) as damaged:
+        found.undo()
+    assert damaged.value.code == "journal_damaged"
+    with FileLock(journal.with_suffix(".lock")), pytest.raises(Conflict) as locked:
+        found.write([second])
+    assert locked.value.code == "locate_in_progress"
+    assert not any(photo.is_unlocated for photo in found.list_photos())
+    journal.write_bytes(intact)
+    assert sorted(found.undo().removed) == ["1.jpg", "2.jpg"]

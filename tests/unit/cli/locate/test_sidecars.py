@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import io
+import os
 from pathlib import Path
+from unittest.mock import Mock
+from xml.sax.saxutils import quoteattr
 
 import pyexiv2
 import pytest
 
 from services.cli.ingest.local_headers import find_sidecars, read_local_header
-from services.cli.locate.sidecars import add_position
-from shared.errors import Unprocessable
+from services.cli.locate.sidecars import (
+    add_position,
+    has_estimate,
+    remove_position,
+    replace_sidecar,
+)
+from shared.errors import Misconfigured, Unprocessable
 from shared.imaging.xmp import EXIF
 from tests.support.photos import photo_bytes, sidecar_position
 
@@ -44,6 +52,51 @@ def test_a_sidecar_is_edited_and_not_replaced() -> None:
     assert edited[:begin] + edited[end:] == DARKTABLE
     assert b'rdf:about="uuid:1"' in edited[begin:end], "the same subject"
     assert b'exif:GPSLatitude="48,51.502416N"' in edited
+
+
+@pytest.mark.parametrize("subject", ["uuid:1", "", "it's", 'a "b" c', "a 'b' \"c\" & \n<d>"])
+def test_a_sidecar_without_what_was_added_is_the_one_of_before(subject: str) -> None:
+    about = f"rdf:about={quoteattr(subject)}".encode()
+    before = DARKTABLE.replace(b'rdf:about="uuid:1"', about)
+    edited = add_position(before, *PLACES[0], 12.0, 338.0)
+    assert edited != before
+    assert remove_position(edited) == before
+    assert remove_position(add_position(None, *PLACES[0], 12.0)) is None
+
+
+def test_an_added_element_that_was_edited_is_recognised_and_left() -> None:
+    edited = add_position(DARKTABLE, *PLACES[0], 12.0).replace(b"\n    exif:", b" exif:")
+    assert has_estimate(edited)
+    assert remove_position(edited) == edited
+    assert not has_estimate(DARKTABLE)
+
+
+def test_a_sidecar_is_written_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.jpg.xmp"
+    path.write_bytes(DARKTABLE)
+    for owner, name in ((os, "fsync"), (Path, "replace")):
+        with monkeypatch.context() as broken:
+            broken.setattr(owner, name, Mock(side_effect=OSError("no space left")))
+            with pytest.raises(Misconfigured):
+                replace_sidecar(tmp_path, path, b"new", DARKTABLE)
+        assert [each.read_bytes() for each in tmp_path.iterdir()] == [DARKTABLE]
+
+
+def test_a_link_to_a_sidecar_outside_the_folder_is_not_written_to(tmp_path: Path) -> None:
+    (tmp_path / "outside.xmp").write_bytes(DARKTABLE)
+    folder = tmp_path / "trip"
+    folder.mkdir()
+    (folder / "a.xmp").symlink_to(tmp_path / "outside.xmp")
+    (folder / "b.xmp").write_bytes(DARKTABLE)
+    (folder / "c.xmp").symlink_to(folder / "b.xmp")
+    with pytest.raises(Unprocessable) as refused:
+        replace_sidecar(folder, folder / "a.xmp", b"new", DARKTABLE)
+    assert refused.value.code == "outside_folder"
+    replace_sidecar(folder, folder / "c.xmp", b"new", DARKTABLE)
+    assert (folder / "c.xmp").is_symlink()
+    assert (folder / "b.xmp").read_bytes() == b"new"
 
 
 def test_coordinates_that_are_there_are_not_changed() -> None:

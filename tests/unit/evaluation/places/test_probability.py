@@ -241,8 +241,18 @@ def test_the_threshold_is_the_lowest_with_the_certainty_as_share_of_right_answer
     answered = [s for s in unsure if s.probabilities[1] >= found]
     wrong = sum(not s.is_right[1] for s in answered)
     assert (wrong + 1) / (len(sure) + len(answered) + 1) <= 0.05
-    assert choose_threshold(unsure, 0.95) == 0.95
-    assert choose_threshold([], 0.95) == 0.95
+    overconfident = [held_out([0.1, 0.91 + n / 1000], [False, n % 2 == 0]) for n in range(20)]
+    assert choose_threshold(overconfident, 0.95) == 0.95
+
+
+def test_where_no_sample_is_probabilities_above_the_threshold_are_the_certainty_in_the_mean() -> (
+    None
+):
+    surer = [held_out([0.99, 0.99], [True, True]) for _ in range(90)]
+    too_few = [held_out([0.97, 0.97], [True, True]) for _ in range(5)]
+    for samples in (surer, too_few, []):
+        assert choose_threshold(samples, 0.95) == pytest.approx(0.9)
+    assert choose_threshold([], 0.99) == pytest.approx(0.98)
 
 
 # --- elsewhere -------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
-"""`placewise` as a client of the fork server: `forked_program` in tests/support/processes.py.
+"""A program as a client of the fork server: `forked_command` in tests/support/processes.py.
 
-    python -IS forked_placewise.py SERVER PROGRAM [ARGUMENT]...
+    python -IS forked_program.py SERVER PROGRAM [ARGUMENT]...
 
 The fork has the standard files, environment and folder of this process, which imports little and
 ends with the exit code of the fork. The server kills the fork when a signal ends this process.
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import select
 import socket
 import sys
 import time
@@ -26,6 +27,8 @@ def main() -> int:
         control.connect(f"\0{server}")
         start = {"command": command, "env": dict(os.environ), "cwd": os.getcwd()}  # noqa: PTH109
         pid = ask(control, start, [0, 1, 2])
+        assert pid is not None
+        select.select([os.pidfd_open(pid)], [], [])
         while (code := ask(control, {"ended": pid})) is None:
             time.sleep(LOOK_SECONDS)
     return code if code >= 0 else 128 - code  # as a shell reports a signal

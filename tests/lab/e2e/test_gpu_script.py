@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tests.support.processes import forked_program
 
-ROOT = Path(__file__).parents[4]
+ROOT = Path(__file__).parents[3]
 TINY = {
     "DEVICE": "cpu",
     "EXTRACTORS": "test-tiny-vlad",
