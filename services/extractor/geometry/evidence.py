@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 from uuid import UUID
 
@@ -70,8 +70,7 @@ def agreeing_pairs(photos: Sequence[PhotoToMap], matches: VerifiedMatches) -> ND
     contains the photos' steps as well as the errors of their coordinates. Coordinates that
     contradict most matches of a photo are not believed, and drop none.
     """
-    places = {photo.id: photo.position for photo in photos}
-    own = np.array([_horizontal(places.get(id_)) for id_ in matches.photo_ids])
+    own = positions_of(matches.photo_ids, photos)[:, :2]
     one, other = matches.pairs.reshape(-1, 2).T
     counts = np.array([len(k) for k in matches.keypoints], int)
     contradicts = np.zeros(len(counts), dtype=bool)
@@ -87,8 +86,11 @@ def agreeing_pairs(photos: Sequence[PhotoToMap], matches: VerifiedMatches) -> ND
     return ~contradicts
 
 
-def _horizontal(position: Floats | None) -> Floats:
-    return np.full(2, np.nan) if position is None else position[:2]
+def positions_of(ids: Iterable[UUID], photos: Sequence[PhotoToMap]) -> Floats:
+    """Return the positions (n, 3) of photos, NaN where they are unknown."""
+    known = {photo.id: photo.position for photo in photos if photo.position is not None}
+    places = [known.get(id_, (np.nan,) * 3) for id_ in ids]
+    return np.array(places, float).reshape(-1, 3)
 
 
 def best_pairs(one: Any, other: Any, counts: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -6,7 +6,7 @@ Soc. B 227, 1986). A model that begins with the wrong one is bent, and contradic
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 from uuid import UUID
 
@@ -19,13 +19,13 @@ from services.extractor.geometry.evidence import (
     best_pairs,
     find_misplaced,
     fit_to_positions,
+    positions_of,
     with_heights,
 )
 from services.extractor.geometry.lookalikes import find_lookalikes
 from services.extractor.geometry.matching import VerifiedMatches
 from services.extractor.geometry.pairs import Pairs
 from services.extractor.geometry.pycolmap_models import PhotoToMap, component_of, require_pycolmap
-from shared.geometry.cameras import Floats
 from shared.geometry.frames import MIN_AGREEING_SHARE, UNKNOWN_ALTITUDE_SIGMA_M
 from shared.matching.verification import MAX_EPIPOLAR_ERROR_PIXELS
 
@@ -33,14 +33,6 @@ MIN_PRIOR_SIGMA_M = 0.02
 """Least standard deviation of coordinates: that of a survey"""
 LOSS_SCALE_PIXELS = 0.5
 """Observations that are farther off count less and less: about the median error of XFeat"""
-
-
-def _positions(ids: Iterable[UUID], photos: Sequence[PhotoToMap]) -> Floats:
-    """Return the positions (n, 3) of photos, NaN where they are unknown."""
-    of_id = {photo.id: photo.position for photo in photos}
-    unknown = np.full(3, np.nan)
-    places = [unknown if of_id[id_] is None else of_id[id_] for id_ in ids]
-    return np.array(places, float).reshape(-1, 3)
 
 
 def misplaced_photos(
@@ -58,7 +50,7 @@ def misplaced_photos(
         is_used: (m,) matches that the model was made of; all tell whether it is right.
     """
     component = component_of(model, {str(photo.id): photo for photo in photos})
-    positions = _positions(component.photo_ids, photos)
+    positions = positions_of(component.photo_ids, photos)
     rows = {id_: row for row, id_ in enumerate(component.photo_ids)}
     numbers = np.array([rows.get(id_, -1) for id_ in matches.photo_ids], np.int32)[matches.pairs]
     inside = np.flatnonzero((numbers >= 0).all(axis=1))
@@ -161,7 +153,7 @@ def _move_to_positions(
     pycolmap: Any, model: Any, images: Sequence[Any], photos: Sequence[PhotoToMap]
 ) -> list[Any]:
     """Move a model to the positions of its photos, and return these as priors; [] if unknown."""
-    positions = _positions((UUID(image.name) for image in images), photos)
+    positions = positions_of((UUID(image.name) for image in images), photos)
     rotations = [image.cam_from_world().rotation.matrix() for image in images]
     known = np.flatnonzero(np.isfinite(positions[:, :2]).all(axis=1))
     if len(known) < MIN_BLOCK:
