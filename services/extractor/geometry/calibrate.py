@@ -65,7 +65,7 @@ class CoordinateProposal:
 
     photo_id: str
     latitude: float
-    """of the photo"""
+    """when it was reconstructed"""
     longitude: float
     proposed_latitude: float
     proposed_longitude: float
