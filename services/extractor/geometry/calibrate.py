@@ -63,12 +63,13 @@ class LeftOutPose:
 class CoordinateProposal:
     """Coordinates that agree with the model, for a photo whose own disagree."""
 
-    photo: UUID
+    photo_id: str
     latitude: float
+    """when it was reconstructed"""
     longitude: float
-    altitude_m: float | None
+    proposed_latitude: float
+    proposed_longitude: float
     distance_m: float
-    """from the photo's coordinates"""
     radius_95_m: float
     """of the proposed ones: with the errors of the alignment and of the photos that agree"""
 
@@ -346,10 +347,11 @@ def propose_coordinates(
         place = alignment.origin.to_geographic(similarity.apply(centres[row]))
         proposals.append(
             CoordinateProposal(
-                component.photo_ids[row],
+                str(component.photo_ids[row]),
+                float(latitudes[row]),
+                float(longitudes[row]),
                 place.latitude,
                 place.longitude,
-                place.altitude_m if similarity.knows_altitude else None,
                 float(alignment.residuals_m[row]),
                 math.hypot(normal_radii(covariances[row])[1], NORMAL_95[1] * alignment.rms_m),
             )

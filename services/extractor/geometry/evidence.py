@@ -7,8 +7,8 @@ tells such matches before a model is made of them.
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from typing import Any
 from uuid import UUID
 
@@ -25,8 +25,6 @@ NEAR_M = 3 * GPS_SIGMA_M
 """Coordinates that are so near each other contradict no match"""
 MAX_STEPS = 3.0
 """Distance of two photos that match, in usual steps"""
-MIN_CONFIRMED = 8
-"""Matches of a pair that lead over a third photo, too"""
 MIN_FIRST_STEPS = 1.4
 """Usual steps by the coordinates as they are, of which SMOOTHED_WITH of them leave three sigmas"""
 SURE_MATCHES = 2
@@ -69,12 +67,10 @@ def agreeing_pairs(photos: Sequence[PhotoToMap], matches: VerifiedMatches) -> ND
     """Return the (m,) pairs without those of photos that are too far apart by their coordinates.
 
     How far that is, is learned from the best pairs of each photo: the median of their distances
-    contains the photos' steps as well as the errors of their coordinates. Photos that are farther
-    apart agree if a third one, which agrees with both, confirms their matches. Coordinates that
+    contains the photos' steps as well as the errors of their coordinates. Coordinates that
     contradict most matches of a photo are not believed, and drop none.
     """
-    places = {photo.id: photo.position for photo in photos}
-    own = np.array([_horizontal(places.get(id_)) for id_ in matches.photo_ids])
+    own = positions_of(matches.photo_ids, photos)[:, :2]
     one, other = matches.pairs.reshape(-1, 2).T
     counts = np.array([len(k) for k in matches.keypoints], int)
     contradicts = np.zeros(len(counts), dtype=bool)
@@ -82,49 +78,22 @@ def agreeing_pairs(photos: Sequence[PhotoToMap], matches: VerifiedMatches) -> ND
     for _ in range(PASSES):
         distances = np.linalg.norm(positions[one] - positions[other], axis=1)
         agreeing = np.where(np.isfinite(distances) & ~contradicts, counts, 0)
-        sure = _best_pairs(one, other, agreeing)
+        sure = best_pairs(one, other, agreeing)
         step = float(np.median(distances[sure])) if len(sure) else np.inf
         first_step = first_step or step
         contradicts = distances > max(NEAR_M, MAX_STEPS * step, MIN_FIRST_STEPS * first_step)
-        contradicts[_confirmed(matches, contradicts)] = False
         positions = _smoothed(own, one, other, counts, contradicts)
     return ~contradicts
 
 
-def _confirmed(matches: VerifiedMatches, contradicts: NDArray[np.bool_]) -> list[int]:
-    """Return the contradicting pairs whose matches agree with those that lead over a third photo.
-
-    Both of the third photo's pairs are none of the contradicting.
-    """
-    rows = {}
-    neighbours = defaultdict[int, set[int]](set)
-    for row in np.flatnonzero(~contradicts).tolist():
-        one, other = matches.pairs[row].tolist()
-        rows[one, other], rows[other, one] = (row, 1), (row, -1)
-        neighbours[one].add(other)
-        neighbours[other].add(one)
-
-    def lead(one: int, other: int) -> dict[int, int]:
-        row, direction = rows[one, other]
-        return dict(matches.keypoints[row][:, ::direction].tolist())
-
-    found = []
-    for row in np.flatnonzero(contradicts).tolist():
-        one, other = matches.pairs[row].tolist()
-        for third in neighbours[one] & neighbours[other]:
-            to, back = lead(one, third), lead(third, other)
-            direct = matches.keypoints[row].tolist()
-            if sum(back.get(to.get(a, -1), -1) == b for a, b in direct) >= MIN_CONFIRMED:
-                found.append(row)
-                break
-    return found
+def positions_of(ids: Iterable[UUID], photos: Sequence[PhotoToMap]) -> Floats:
+    """Return the positions (n, 3) of photos, NaN where they are unknown."""
+    known = {photo.id: photo.position for photo in photos if photo.position is not None}
+    places = [known.get(id_, (np.nan,) * 3) for id_ in ids]
+    return np.array(places, float).reshape(-1, 3)
 
 
-def _horizontal(position: Floats | None) -> Floats:
-    return np.full(2, np.nan) if position is None else position[:2]
-
-
-def _best_pairs(one: Any, other: Any, counts: NDArray[np.intp]) -> NDArray[np.intp]:
+def best_pairs(one: Any, other: Any, counts: NDArray[np.intp]) -> NDArray[np.intp]:
     """Return the pairs that are among the SURE_MATCHES best of one of their photos."""
     taken = Counter[int]()
     best = []

@@ -13,7 +13,7 @@ import hashlib
 import sys
 import threading
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,7 +28,6 @@ from sqlalchemy.orm import Session
 from services.extractor.child_process import run_in_child
 from services.extractor.geometry.calibrate import (
     ComponentPhotos,
-    CoordinateProposal,
     calibrate_components,
     propose_coordinates,
 )
@@ -410,8 +409,8 @@ class ReconstructionJob:
             )
             stored.append(about.model_copy(update={"alignment": aligned}))
             rows = [photos[id_].row for id_ in component.photo_ids]
-            for each in propose_coordinates(component, alignment, *_coordinates(rows)):
-                proposals.append(_to_json(each, photos[each.photo].row))
+            proposed = propose_coordinates(component, alignment, *_coordinates(rows))
+            proposals += map(asdict, proposed)
         result |= {
             "components": len(stored),
             "aligned": sum(each.alignment is not None for each in stored),
@@ -520,18 +519,6 @@ def _seconds(photos: Iterable[MapPhoto]) -> Floats:
 
 def _numbers(values: Iterable[float | None]) -> Floats:
     return np.array([np.nan if value is None else value for value in values], float)
-
-
-def _to_json(proposal: CoordinateProposal, photo: Photo) -> dict[str, Any]:
-    return {
-        "photo_id": str(photo.id),
-        "latitude": photo.latitude,
-        "longitude": photo.longitude,
-        "proposed_latitude": proposal.latitude,
-        "proposed_longitude": proposal.longitude,
-        "distance_m": proposal.distance_m,
-        "radius_95_m": proposal.radius_95_m,
-    }
 
 
 def _left_out_result(

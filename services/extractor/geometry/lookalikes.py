@@ -22,25 +22,19 @@ SAME_VIEW_COSINE, SAME_VIEW_SCALE = math.cos(math.radians(20)), 1.5
 """A detector finds a point again from directions and distances that differ by less"""
 ALIKE_SHARE = 0.5
 """of what photos usually share of the points that they should: less contradicts their poses"""
-MIN_KEPT_SHARE = 0.1
-"""of the matches of two photos are points that both see, if the model shows them at one place"""
 MIN_MISSING = 60.0
 """Points that the photos of two blocks lack together, to contradict"""
 
 
-def find_lookalikes(
-    component: Component, pairs: Pairs, counts: NDArray[np.intp]
-) -> tuple[NDArray[np.intp], Floats]:
+def find_lookalikes(component: Component, pairs: Pairs) -> tuple[NDArray[np.intp], Floats]:
     """Return the (n,) block of each photo, and the (m,) points that each pair has more than enough.
 
-    Block 0 is the rest of the model. The photos of another block contradict those of a larger one,
-    or it is a photo with more matches with one that the model shows elsewhere than with any there.
+    Block 0 is the rest of the model. The photos of another block contradict those of a larger one.
 
     Args:
         pairs: (m, 2) rows of photos that match.
-        counts: (m,) matches of each pair.
     """
-    expected, common, shared = _count_shared(component, pairs)
+    expected, common = _count_shared(component, pairs)
     share = common / np.maximum(expected, 1)
     best = np.zeros(len(component.photo_ids))
     for side in pairs[expected >= MIN_EXPECTED].T:
@@ -55,27 +49,18 @@ def find_lookalikes(
             found[labels == label] = label + 1
         else:
             kept.append(label)
-    is_there = shared > MIN_KEPT_SHARE * counts
-    here = np.zeros(len(best))  # most matches with a photo that the model shows there, too
-    for side in pairs.T:
-        np.maximum.at(here, side, np.where(is_there, counts, 0))
-    weaker = pairs[np.arange(len(pairs)), here[pairs].argmin(axis=1)]
-    alone = np.unique(weaker[~is_there & (counts > here[weaker])])
-    alone = alone[found[alone] == 0]
-    found[alone] = len(best) + 1 + alone
     return found, excess
 
 
 def _count_shared(component: Component, pairs: Pairs) -> NDArray[np.intp]:
-    """Return (3, m): points that two photos should both see, that they do, and that they share.
+    """Return (2, m): points that two photos should both see, and that they do.
 
-    Of the two, that counts which should see fewer of the other's. They may share points that they
-    see from different sides, too.
+    Of the two, that counts which should see fewer of the other's.
     """
     centres = component.centres()
     seen = [np.unique(numbers[numbers >= 0]) for numbers in component.point_numbers]
 
-    def count(one: int, other: int) -> tuple[int, int, int]:
+    def count(one: int, other: int) -> tuple[int, int]:
         rays, others = (component.points[seen[one]] - centres[row] for row in (one, other))
         lengths, other_lengths = (np.linalg.norm(each, axis=1) for each in (rays, others))
         camera = component.cameras[component.camera_numbers[other]]
@@ -86,11 +71,10 @@ def _count_shared(component: Component, pairs: Pairs) -> NDArray[np.intp]:
         pixels = camera.project(axes[is_same])
         inside = ((pixels > 0) & (pixels < (camera.width, camera.height))).all(axis=1)
         should = seen[one][is_same][inside]
-        shared = int(np.isin(seen[one], seen[other]).sum())
-        return len(should), int(np.isin(should, seen[other]).sum()), shared
+        return len(should), int(np.isin(should, seen[other]).sum())
 
     counts = [min(count(one, other), count(other, one)) for one, other in pairs.tolist()]
-    return np.array(counts, np.intp).reshape(-1, 3).T
+    return np.array(counts, np.intp).reshape(-1, 2).T
 
 
 def _cluster(count: int, pairs: Pairs, excess: Floats) -> NDArray[np.intp]:

@@ -21,7 +21,6 @@ from services.extractor.geometry.pycolmap_models import (
     MIN_MODEL_PHOTOS,
     RANDOM_SEED,
     PhotoToMap,
-    component_of,
     deregister,
     image_names,
     require_pycolmap,
@@ -137,7 +136,6 @@ def _map(
             return sorted(found.values(), key=lambda model: -model.num_reg_images())
 
         is_used = agreeing_pairs(photos, matches)
-        by_name = {str(photo.id): photo for photo in photos}
         database = Path(scratch) / "first.db"
         write_database(pycolmap, photos, matches.only(is_used), database, models)
         rest = {str(photo.id) for photo in photos}.difference(*map(image_names, models))
@@ -159,7 +157,7 @@ def _map(
             made = run(path, "", names, is_known)
             for each in made:
                 adjust_to_positions(pycolmap, each, photos)
-            return [(each, *judge(component_of(each, by_name))) for each in made]
+            return [(each, *judge(each)) for each in made]
 
         anew: list[Judged] = []
         for cuts in range(MAX_CUTS + 1):
@@ -180,7 +178,7 @@ def _map(
                 for each, misplaced, _ in anew:
                     while misplaced:  # without these, others may have nothing that holds them
                         deregister(each, misplaced)
-                        misplaced, _ = judge(component_of(each, by_name))
+                        misplaced, _ = judge(each)
                 break
             is_used &= ~wrong
         plausible = [each for each, *_ in anew if _bent_focal_length(each) is None]
@@ -229,11 +227,10 @@ def _pipeline_options(pycolmap: Any, is_focal_length_known: bool) -> Any:
 def _with_cameras_of(model: Any, photos: Sequence[PhotoToMap]) -> list[PhotoToMap]:
     """Return the photos with the focal lengths of a model's cameras."""
     by_name = {str(photo.id): photo for photo in photos}
-    focals = {}
-    for number in model.reg_image_ids():
-        image = model.image(number)
-        key = by_name[image.name].camera_key
-        focals[key] = float(image.camera.mean_focal_length()) / WORKING_SIDE
+    focals = {
+        by_name[image.name].camera_key: float(image.camera.mean_focal_length()) / WORKING_SIDE
+        for image in map(model.image, model.reg_image_ids())
+    }
     return [
         replace(photo, focal_length=focals.get(photo.camera_key, photo.focal_length))
         for photo in photos

@@ -61,6 +61,11 @@ def test_local_axes_point_east_north_and_up() -> None:
     assert plane.to_geographic(np.array([0.0, 0.0, 7.0])).altitude_m == pytest.approx(7)
 
 
+def geographic(plane: EastNorthUp, metres: np.ndarray) -> np.ndarray:
+    there = map(plane.to_geographic, metres)
+    return np.array([(each.latitude, each.longitude, each.altitude_m) for each in there]).T
+
+
 class Walk:
     """Photos of a walk with their coordinates, which are noisy."""
 
@@ -80,10 +85,7 @@ class Walk:
         self.sigmas = np.full(count, 5.0)
 
     def locate(self, enu: np.ndarray) -> None:
-        there = [self.plane.to_geographic(row) for row in enu]
-        self.latitudes = np.array([e.latitude for e in there])
-        self.longitudes = np.array([e.longitude for e in there])
-        self.altitudes = np.array([e.altitude_m for e in there])
+        self.latitudes, self.longitudes, self.altitudes = geographic(self.plane, enu)
 
     def align(self) -> Alignment:
         return align(
@@ -97,14 +99,9 @@ class Walk:
 
     def errors(self, found: Alignment) -> np.ndarray:
         """(n, 3) metres in the plane of the walk."""
-        there = [found.origin.to_geographic(row) for row in found.similarity.apply(self.centres)]
-        metres = self.plane.from_geographic(
-            [e.latitude for e in there],
-            [e.longitude for e in there],
-            [e.altitude_m for e in there],
-        )
-        errors: np.ndarray = metres - self.enu
-        return errors
+        there = geographic(found.origin, found.similarity.apply(self.centres))
+        metres = self.plane.from_geographic(*there)
+        return np.asarray(metres - self.enu)
 
 
 @pytest.mark.parametrize("place", PLACES.values(), ids=PLACES)
@@ -222,8 +219,7 @@ def camera(heading: float, pitch: float, roll: float) -> np.ndarray:
         @ rotation_of_vector(math.radians(pitch) * right)
         @ rotation_of_vector(math.radians(roll) * forward)
     )
-    rotation: np.ndarray = np.array([right, -up, forward]) @ turn.T
-    return rotation
+    return np.asarray(np.array([right, -up, forward]) @ turn.T)
 
 
 @given(st.floats(0, 359.9), st.floats(-89, 89), st.floats(-179, 179))

@@ -97,9 +97,7 @@ class FoldedWalk:
         self.modelled = self.places.copy()
         self.modelled[40:] = first[5:17]
         self.centres = self.modelled @ TURN / 3
-        ahead = np.concatenate(
-            [np.tile([0.5, 1.0, 0.1], (40, 1)), np.tile([1.0, 0.5, 0.1], (12, 1))]
-        )
+        ahead = np.repeat([[0.5, 1.0, 0.1], [1.0, 0.5, 0.1]], (40, 12), axis=0)
         self.rotations = [
             looking(place, place + way) @ TURN
             for place, way in zip(self.places, ahead, strict=True)

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from uuid import UUID
 
 import numpy as np
 import pytest
 
-from services.extractor.geometry.lookalikes import find_lookalikes
 from services.extractor.geometry.mapping import map_photos
 from services.extractor.geometry.matching import match_pairs
 from services.extractor.geometry.pycolmap_models import PhotoToMap
-from shared.geometry.component import NO_POINT, Component
+from shared.geometry.component import Component
 from shared.geometry.frames import rotation_of_vector
 from shared.matching.features import LocalFeatures
 from shared.matching.matchers import MutualNearest
-from tests.support.reconstructed_scene import CAMERA, DIMENSION, ReconstructedScene, looking
+from tests.support.reconstructed_scene import CAMERA, DIMENSION, looking
 
 FIRST, SECOND, STEP_M = 16, 10, 2.5
 SIZE = (CAMERA.width, CAMERA.height)
@@ -76,10 +74,8 @@ class AlikeStreets:
         ]
         pairs = np.array([(i, j) for j in range(len(photos)) for i in range(j)], np.int32)
         matches = match_pairs(self.features, pairs, MutualNearest(0.82), lambda _: None)
-        return [
-            each.component
-            for each in map_photos(photos, matches, folder, lambda _: None, lambda: None)
-        ]
+        found = map_photos(photos, matches, folder, lambda _: None, lambda: None)
+        return [each.component for each in found]
 
 
 @pytest.mark.parametrize(("seed", "noise_m"), [(1, None), (5, 30.0)])
@@ -87,11 +83,8 @@ def test_streets_that_look_alike_are_components_of_their_own(
     tmp_path: Path, seed: int, noise_m: float | None
 ) -> None:
     streets = AlikeStreets(seed)
-    positions = None
-    if noise_m is not None:
-        positions = np.array(streets.positions) + streets.rng.normal(
-            0, noise_m, (FIRST + SECOND, 3)
-        )
+    noise = streets.rng.normal(0, noise_m or 0.0, (FIRST + SECOND, 3))
+    positions = None if noise_m is None else np.array(streets.positions) + noise
     found = streets.reconstruct(tmp_path, positions)
     members = [{photo.int <= FIRST for photo in each.photo_ids} for each in found]
     assert all(len(each) == 1 for each in members)
@@ -104,15 +97,3 @@ def test_coordinates_decide_whether_alike_photos_show_one_place(tmp_path: Path) 
     positions = np.array(streets.positions[:FIRST] + streets.positions[:SECOND])
     (found,) = streets.reconstruct(tmp_path, positions)
     assert len(found.photo_ids) >= FIRST + SECOND - 2
-
-
-def test_photo_that_matches_others_elsewhere_is_a_block_of_its_own() -> None:
-    scene = ReconstructedScene(photos=6)
-    pairs = np.array([(i, j) for j in range(6) for i in range(j)], np.int32)
-    counts = np.where(pairs[:, 0] == 0, 90, 50)
-    numbers = list(scene.component.point_numbers)
-    numbers[0] = np.where(numbers[0] % 40 == 0, numbers[0], NO_POINT)
-    numbers[1:5] = [np.where(each % 40 == 0, NO_POINT, each) for each in numbers[1:5]]
-    component = replace(scene.component, point_numbers=tuple(numbers))
-    blocks, _ = find_lookalikes(component, pairs, counts)
-    assert np.flatnonzero(blocks).tolist() == [0]

@@ -12,7 +12,8 @@ import pytest
 from services.extractor.geometry.imported_models import import_model, turned_camera
 from services.extractor.geometry.mapping import Judged, MappedComponent, count_joined, map_photos
 from services.extractor.geometry.matching import VerifiedMatches, match_pairs
-from services.extractor.geometry.pycolmap_models import PhotoToMap
+from services.extractor.geometry.positions import misplaced_photos
+from services.extractor.geometry.pycolmap_models import PhotoToMap, deregister
 from shared.errors import Unprocessable
 from shared.geometry.cameras import Camera, Rays
 from shared.geometry.colmap_model import CAMERA_MODELS
@@ -40,8 +41,7 @@ def position_errors(found: Component, scene: ReconstructedScene) -> np.ndarray:
     centres = np.array([truth[photo] for photo in found.photo_ids])
     scale, rotation, translation = umeyama(found.centres(), centres, np.ones(len(centres)))
     aligned = scale * found.centres() @ rotation.T + translation
-    errors: np.ndarray = np.linalg.norm(aligned - centres, axis=1)
-    return errors
+    return np.asarray(np.linalg.norm(aligned - centres, axis=1))
 
 
 def only(components: list[MappedComponent]) -> MappedComponent:
@@ -110,6 +110,31 @@ def test_photo_is_in_one_component_only(
 ) -> None:
     found = map_all(*everything(scene), tmp_path, mapped.folder, mapped.folder)
     assert set(found.component.photo_ids) == set(scene.features)
+
+
+def test_photos_are_misplaced_that_contradict_their_best_matches_or_match_one_outside_more(
+    scene: ReconstructedScene, mapped: MappedComponent
+) -> None:
+    photos, matches = everything(scene)
+    ids = [str(photo.id) for photo in photos]
+    turn = pycolmap.Rigid3d(pycolmap.Rotation3d([0, 0, 0.05, 1]), np.zeros(3))
+
+    def misplaced(
+        *turned: int, outside: int = PHOTOS, found: VerifiedMatches = matches
+    ) -> set[int]:
+        model = pycolmap.Reconstruction(str(mapped.folder))
+        deregister(model, set(ids[outside : outside + 1]))
+        for image in map(model.image, model.reg_image_ids()):
+            if ids.index(image.name) in turned:
+                frame = model.frame(image.frame_id)
+                frame.set_cam_from_world(image.camera_id, turn * image.cam_from_world())
+        is_used = np.ones(len(found.pairs), dtype=bool)
+        return set(map(ids.index, misplaced_photos(model, photos, found, is_used)[0]))
+
+    assert [misplaced(), misplaced(3), misplaced(2, 4)] == [set(), {3}, {2, 4}]
+    assert misplaced(1, 3, 5) == set(range(PHOTOS))  # the model is bent
+    few = matches.only((matches.pairs[:, 0] > 0) | np.isin(matches.pairs[:, 1], (1, 7)))
+    assert [misplaced(outside=1), misplaced(outside=1, found=few)] == [set(), {0}]
 
 
 def test_colmap_model_has_the_sizes_of_the_photos(mapped: MappedComponent) -> None:
