@@ -1,4 +1,4 @@
-"""Where the photos of a folder were taken: `@UTM@` names and CSV tables."""
+"""Where the photos of a folder were taken: `@UTM@` names, CSV tables and lists."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from services.cli.ingest.geotags import (
     find_local_sources,
     find_photos,
     list_photos,
+    read_photo_manifest,
 )
 from services.cli.locate.sidecars import add_position
 from shared.errors import InvalidRequest
@@ -164,3 +165,12 @@ def test_sidecars_and_the_zone_of_the_camera_add_what_the_photos_lack(tmp_path: 
     assert [each["reason"] for each in report.not_understood] == ["its XMP is damaged"]
     photos, _ = add_local_headers(find_photos(tmp_path / "1.jpg", None, None), "+05:00")
     assert photos[0].fields["captured_at"] == "2026-05-01T07:00:00+00:00"
+
+
+def test_a_list_that_names_a_missing_photo_is_refused_by_its_line(tmp_path: Path) -> None:
+    (tmp_path / "1.jpg").write_bytes(b"one")
+    data = b'{"filename": "1.jpg"}\n{"filename": "2.jpg"}\n'
+    with pytest.raises(InvalidRequest) as caught:
+        read_photo_manifest(tmp_path / "list.jsonl", data)
+    assert caught.value.code == "bad_manifest"
+    assert [error["line"] for error in caught.value.extra["errors"]] == [2]

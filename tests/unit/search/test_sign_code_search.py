@@ -11,6 +11,7 @@ from hypothesis import given, settings
 
 from services.search import executor, kernels, sign_code_search
 from services.search.chunk_loader import LoadedChunk
+from services.search.dense_scan import compile_kernel
 from services.search.query_batcher import QueryBatcher
 from services.search.sign_code_search import scan_first_level
 from services.search.snapshot import Snapshot
@@ -139,10 +140,12 @@ def test_queries_that_come_together_get_the_answers_that_they_get_alone(
 
 
 def test_warm_up_compiles_all_kernels() -> None:
+    rows = places(3, 400, 98_304)
+    snapshot = snapshot_of(rows)
     sign_code_search.compile_kernels()
+    compile_kernel(snapshot)
     loops = [one for one in vars(kernels).values() if hasattr(one, "signatures")]
     before = {loop.py_func.__name__: len(loop.signatures) for loop in loops}
     assert before["hamming_distances"] == 1
-    rows = places(3, 400, 98_304)
-    answer(snapshot_of(rows), rows[0], np.ones(400, bool), 300)
+    answer(snapshot, rows[0], np.ones(400, bool), 300)
     assert {loop.py_func.__name__: len(loop.signatures) for loop in loops} == before
