@@ -46,8 +46,8 @@ run: $(RUNNABLE) ## serve the embedded Placewise on http://HOST:PORT, data under
 test: $(INSTALLED) ## all tests (PLACEWISE_TEST_DATA=FOLDER adds those on real photos)
 	$(BIN)/python -m pytest tests --numprocesses auto --dist loadfile --no-loadscope-reorder
 
-test-lab: $(INSTALLED) ## tests of the lab, with those from end to end that `make test` leaves out
-	PLACEWISE_TEST_LAB=1 $(BIN)/python -m pytest tests/lab tests/e2e/test_notebooks.py --numprocesses auto --dist loadfile --no-loadscope-reorder
+test-lab: $(INSTALLED) ## tests of the lab (part of `make test`)
+	$(BIN)/python -m pytest tests/lab --numprocesses auto --dist loadfile --no-loadscope-reorder
 
 test-chaos: $(INSTALLED) ## kill, stop and restart services of a whole deployment under load, and Milvus
 	PLACEWISE_TEST_CHAOS=$${PLACEWISE_TEST_CHAOS:-1} $(BIN)/python -m pytest tests/faults/test_chaos.py tests/faults/test_milvus.py tests/faults/test_rolling.py --numprocesses 2 --dist loadfile

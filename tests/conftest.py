@@ -44,7 +44,6 @@ REAL_PHOTOS = "PLACEWISE_TEST_DATA"
 BROWSER = "PLACEWISE_TEST_BROWSER"
 IMAGES = "PLACEWISE_TEST_IMAGES"
 CHAOS = "PLACEWISE_TEST_CHAOS"
-LAB = "PLACEWISE_TEST_LAB"
 SERVER_FIXTURES = frozenset({"postgres", "redis", "s3", "moto"})
 SERVER_PARAMETERS = frozenset({"postgresql", "redis", "s3", "moto", "bucket"})
 TESTS = Path(__file__).parent
@@ -62,15 +61,6 @@ OPTIONAL: tuple[tuple[str, list[str], str], ...] = (
     (REAL_PHOTOS, [], f"on real photos: {REAL_PHOTOS}=FOLDER runs them (docs/CONTRIBUTING.md)"),
     (BROWSER, ["browser"], "in a browser: make test-browser runs them"),
     (IMAGES, ["deploy/images"], "of the images: make test-images runs them"),
-    (
-        LAB,
-        [
-            "e2e/test_notebooks.py",
-            "lab/e2e",
-            "lab/integration/training/test_training_improves_recall.py",
-        ],
-        "of the lab from end to end: make test-lab runs them",
-    ),
     (
         CHAOS,
         ["faults/test_chaos.py", "faults/test_milvus.py", "faults/test_rolling.py"],
