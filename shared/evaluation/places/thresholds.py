@@ -103,7 +103,7 @@ def choose_threshold(estimates: Sequence[HeldOutEstimate], certainty: float) -> 
     floor = max(0.5, 1 - MAX_ERROR_FACTOR * (1 - certainty))
     unseen = max(floor, 2 * certainty - 1)
     distinct = np.unique(probabilities[probabilities >= floor])
-    tried = distinct[:: max(1, -(-len(distinct) // CANDIDATES))].tolist()
+    tried: list[float] = distinct[:: max(1, -(-len(distinct) // CANDIDATES))].tolist()
     # One more wrong answer is counted: a new query may be one.
     for candidate, more in [*((each, 1.0) for each in tried), (unseen, 0.0)]:
         reached = probabilities >= candidate
