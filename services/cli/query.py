@@ -255,11 +255,11 @@ def _format_m(length_m: float) -> str:
 
 
 def _format_estimate(estimate: Estimate) -> str:
-    """The headline, with the place that it does not name, and the reason."""
+    """The headline, with the place that it does not name, and the reason if it says more."""
     parts = [estimate.place] if estimate.place and not estimate.levels else []
     if estimate.latitude is not None:
         parts.append(f"{_format_degrees(estimate.latitude)}, {_format_degrees(estimate.longitude)}")
-    return "\n".join([". ".join([estimate.headline, *parts]), estimate.reason])
+    return "\n".join(dict.fromkeys([". ".join([estimate.headline, *parts]), estimate.reason]))
 
 
 def _format_degrees(value: float | None) -> str:

@@ -64,7 +64,7 @@ def estimate_place(
             place=spot.place,
             has_place=True,
             elsewhere=elsewhere,
-            headline="Best guess. How certain it is has not been measured yet.",
+            headline="Best guess. How certain it is has not been measured yet",
             reason=NOT_MEASURED,
         )
     levels = [

@@ -118,6 +118,8 @@ def test_the_headline_and_the_reason_are_those_of_the_server(tmp_path: Path) -> 
     lines = query(tmp_path, answer)[0].splitlines()
     at = lines.index("Here, within 25 m: 97 %. 45.000000, 7.000000")
     assert lines[at + 1] == "So it is."
+    nowhere = query(tmp_path, {"headline": "No place.", "reason": "No place."})[0]
+    assert nowhere.count("No place.") == 1
 
 
 def test_options_of_the_search_are_sent_to_the_server(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ export function verdict(found, measurement, best) {
   const anyFound = found.similar_images.length > 0;
   const bars = estimate.levels.length > 0 && shares(estimate);
   const pose = poseInWords(found.pose);
-  const reason = measurement ?? h("p", { class: "reason" }, estimate.reason);
+  const reason = measurement ?? (estimate.reason !== estimate.headline && h("p", { class: "reason" }, estimate.reason));
   return h("div", { class: `verdict ${kind}` },
     h("p", { class: "badge" }, title),
     h("p", { class: "headline" }, estimate.headline),
