@@ -133,7 +133,9 @@ def _copy_for_others(program: Path, folder: Path) -> Path:
         return program
     package = program.parents[2]
     for part in (package, package.with_name(f"{package.name}.libs")):
-        shutil.copytree(part, folder / part.name)
+        copy = Path(shutil.copytree(part, folder / part.name))
+        for path in (copy, *copy.rglob("*")):  # which a strict umask keeps from others
+            shutil.chown(path, "nobody")
     return folder / program.relative_to(package.parent)
 
 
