@@ -34,7 +34,7 @@ class _BenchmarkGroup(TyperGroup):
             return None
         require_packages("tests", "faiss", "psutil", "pytest", "testcontainers")
         module = importlib.import_module(f"lab.benchmarks.{name.replace('-', '_')}")
-        benchmark = typer.Typer(add_completion=False)
+        benchmark = typer.Typer(add_completion=False, rich_markup_mode=None)
         benchmark.command(name)(module.bench)
         return typer.main.get_command(benchmark)
 
