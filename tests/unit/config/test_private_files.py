@@ -89,6 +89,7 @@ def test_caches_are_private(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         assert check_private(tmp_path / folder) > 1
 
 
+@pytest.mark.usefixtures("no_umask")
 def test_folder_that_exists_keeps_its_mode_and_a_file_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "wide").mkdir(0o755)
     make_private_folder(tmp_path / "wide")
@@ -100,6 +101,7 @@ def test_folder_that_exists_keeps_its_mode_and_a_file_is_no_folder(tmp_path: Pat
             make_private_folder(path)
 
 
+@pytest.mark.usefixtures("no_umask")
 def test_doctor_names_what_others_can_read_and_how_to_change_it(tmp_path: Path) -> None:
     home, photos = tmp_path / "home", tmp_path / "photos"
     settings = Settings(placewise_home=home, upload_dir=photos)
