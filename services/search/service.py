@@ -6,7 +6,6 @@ photos a map has: listen on an internal network.
 
 from __future__ import annotations
 
-import logging
 import threading
 from dataclasses import replace
 from uuid import UUID
@@ -36,8 +35,6 @@ from shared.search_api.protocol import (
     SearchStatus,
 )
 from shared.telemetry.metrics_server import METRICS_CONTENT_TYPE, serve_metrics
-
-log = logging.getLogger(__name__)
 
 # Several syncs were missed, or loading takes too long.
 MAX_READY_LAG_SECONDS = 5.0

@@ -44,7 +44,8 @@ def misplaced_photos(
     """Return the names of a model's misplaced photos, and the (m,) matches that led there.
 
     They contradict their coordinates or their best matches, have more matches with one photo that
-    is not in the model than with all that are, or are a block that only looks like the rest.
+    is not in the model than with all that are, or are a block that only looks like the rest. All
+    are misplaced where many contradict their best matches: those of these led there.
 
     Args:
         is_used: (m,) matches that the model was made of; all tell whether it is right.
@@ -76,7 +77,10 @@ def misplaced_photos(
     misplaced |= elsewhere > here
     images = [model.image(number) for number in sorted(model.reg_image_ids())]
     keypoints = [matches.keypoints[row] for row in used.tolist()]
-    misplaced |= find_contradicted(images, numbers[used], keypoints)
+    contradicted = find_contradicted(images, numbers[used], keypoints)
+    is_bent = contradicted.sum() > (1 - MIN_AGREEING_SHARE) * len(contradicted)
+    contradicts[used] |= is_bent & contradicted[numbers[used]].any(axis=1)
+    misplaced |= contradicted | is_bent
     names = {images[row].name for row in np.flatnonzero(misplaced).tolist()}
     return names, contradicts & is_used
 
@@ -84,7 +88,7 @@ def misplaced_photos(
 def find_contradicted(
     images: Sequence[Any], pairs: Pairs, keypoints: Sequence[NDArray[np.integer[Any]]]
 ) -> NDArray[np.bool_]:
-    """Return the (n,) photos whose best matches a model contradicts; all, if it does many.
+    """Return the (n,) photos whose best matches a model contradicts.
 
     A match agrees if it is near the epipolar lines and not of two points. The photo that is
     contradicted most is left out first, and its matches count for none of the others.
@@ -123,7 +127,6 @@ def find_contradicted(
         if shares.min(initial=1.0) >= MIN_AGREEING_SHARE:
             break
         found[shares.argmin()] = True
-    found |= found.sum() > (1 - MIN_AGREEING_SHARE) * len(found)
     return found
 
 

@@ -108,8 +108,7 @@ def test_answers_equal_brute_force_with_order_and_ties(
 
 def test_rows_opposite_to_the_query_are_ties_whatever_their_rounding() -> None:
     snapshot = snapshot_of(np.array([[1.0000004], [1.0]], np.float32), 1, coded=False)
-    (hit,) = scan(snapshot, np.array([-1.0], np.float32), 1).hits
-    assert (hit.photo_id, hit.score) == (photo(0), -1.0)
+    assert hits_of(scan(snapshot, np.array([-1.0], np.float32), 1)) == [(photo(0), -1.0)]
 
 
 def test_the_kernel_is_compiled_in_advance_exactly_for_maps_that_use_it(

@@ -129,10 +129,14 @@ def test_photos_are_misplaced_that_contradict_their_best_matches_or_match_one_ou
                 frame = model.frame(image.frame_id)
                 frame.set_cam_from_world(image.camera_id, turn * image.cam_from_world())
         is_used = np.ones(len(found.pairs), dtype=bool)
-        return set(map(ids.index, misplaced_photos(model, photos, found, is_used)[0]))
+        names, contradicts = misplaced_photos(model, photos, found, is_used)
+        dropped.append(found.pairs[contradicts].tolist())
+        return set(map(ids.index, names))
 
+    dropped: list[list[list[int]]] = []
     assert [misplaced(), misplaced(3), misplaced(2, 4)] == [set(), {3}, {2, 4}]
     assert misplaced(1, 3, 5) == set(range(PHOTOS))  # the model is bent
+    assert dropped == [[], [], [], [pair for pair in matches.pairs.tolist() if {1, 3, 5} & {*pair}]]
     few = matches.only((matches.pairs[:, 0] > 0) | np.isin(matches.pairs[:, 1], (1, 7)))
     assert [misplaced(outside=1), misplaced(outside=1, found=few)] == [set(), {0}]
 
