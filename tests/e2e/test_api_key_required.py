@@ -67,6 +67,22 @@ def test_probes_and_descriptions_are_open(stranger: httpx2.Client) -> None:
         assert stranger.get(path).status_code in (401, 404), path
 
 
+def test_every_call_says_which_scope_it_needs(stranger: httpx2.Client) -> None:
+    described = stranger.get("/openapi.json").json()
+    assert described["components"]["securitySchemes"]["key"]["scheme"] == "bearer"
+    calls = 0
+    for path, methods in described["paths"].items():
+        for call in methods.values():
+            if not path.startswith(API) and path != "/metrics":
+                assert "security" not in call, path
+                continue
+            ((scope,),) = (needed["key"] for needed in call["security"])
+            assert scope in ("read", "write", "admin"), path
+            assert {"401", "403", "429"} <= call["responses"].keys(), path
+            calls += 1
+    assert calls > 40
+
+
 @pytest.mark.parametrize("path", ["/nowhere", f"{API}/nowhere", "/docs/x", f"/docs%2F..{API}/jobs"])
 def test_calls_without_a_key_are_401_on_unknown_paths_too(
     stranger: httpx2.Client, path: str

@@ -61,6 +61,23 @@ def test_the_client_sends_files_with_a_manifest_and_names_of_objects(
         client.import_objects([{"key": "originals/a.jpg"}])
 
 
+def test_the_client_gives_places_and_restores_a_deleted_photo(
+    client: Client, tmp_path: Path
+) -> None:
+    (tmp_path / "somewhere.jpg").write_bytes(photo_bytes(130))
+    uploaded = client.upload(tmp_path / "somewhere.jpg")
+    client.wait(uploaded)
+    id_ = uploaded.file_id
+    assert id_ in {each.photo.image_id for each in client.propose_places()}
+    place = {"file_id": str(id_), "latitude": 45.5, "longitude": 7.5}
+    assert client.give_places([place]).given == [id_]
+    assert client.photo(id_).latitude == 45.5
+    assert client.undo_places([id_]).restored == [id_]
+    client.delete_photo(id_)
+    assert id_ in {each.image_id for each in client.photos(removed=True)}
+    assert client.restore_photo(id_).latitude is None
+
+
 def index(server: ServerProcess, path: Path, *options: str, code: int = 0) -> dict[str, Any]:
     run = CommandLine(path.parent, server.home)("index", path, *options, "--json")
     report: dict[str, Any] = run.json(code)

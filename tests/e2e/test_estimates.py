@@ -132,6 +132,35 @@ def test_an_evaluation_lets_answers_say_whether_the_place_is_in_the_map(
     ]
 
 
+def test_an_estimate_uses_the_photos_with_a_place_and_counts_the_others(
+    server: ServerProcess,
+) -> None:
+    """Before each photo with coordinates lies one of the same view without any."""
+    numbers = [next(fresh) for _ in range(ENOUGH)]
+    fill(server, "mixed", numbers, *({"latitude": n, "longitude": 7} for n in range(ENOUGH)))
+    put(server, "mixed", [(photo_bytes(number, quality=51), {}) for number in numbers])
+    there = got(server.client.get("/api/v1/maps/mixed"))
+    assert (there["searchable"], there["located"]) == (2 * ENOUGH, ENOUGH)
+    evaluate(server, "mixed")
+
+    answers = [
+        ask(server, "mixed", re_encoded(numbers[n]), top_k=2, elsewhere=0.001) for n in ASKED
+    ]
+    accepted = [
+        (n, answer)
+        for n, answer in zip(ASKED, answers, strict=True)
+        if answer["estimate"]["in_map"]
+    ]
+    assert accepted
+    for n, answer in accepted:
+        assert answer["similar_images"][0]["latitude"] is None
+        assert answer["matches_without_place"] == 1
+        assert answer["estimate"]["latitude"] == pytest.approx(n, abs=1e-6)
+        assert [m["match_probability"] is None for m in answer["similar_images"]] == [
+            m["latitude"] is None for m in answer["similar_images"]
+        ]
+
+
 def test_a_filter_that_nothing_passes_gives_no_place_and_says_so(
     server: ServerProcess, streets: list[int]
 ) -> None:
