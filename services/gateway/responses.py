@@ -1,13 +1,15 @@
-"""Builds responses of the API from rows of the catalog, and the URLs in them."""
+"""Builds responses of the API from rows of the catalog, the URLs in them, and archives."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import tarfile
+from collections.abc import Iterable, Iterator, Mapping
+from datetime import datetime
 from typing import Any, Self, TypeVar
 from urllib.parse import urlencode
 from uuid import UUID
 
-from fastapi.responses import JSONResponse
+from fastapi.responses import JSONResponse, StreamingResponse
 from pydantic import Field
 
 from services.gateway.dependencies import API_PREFIX
@@ -115,3 +117,27 @@ def job_url(job_id: UUID, map_name: str, suffix: str = "") -> str:
 def accepted_headers(status_url: str) -> dict[str, str]:
     """Build the headers of a 202 response."""
     return {"Location": status_url, "Retry-After": "1"}
+
+
+def describe_tar(content: str) -> dict[int | str, dict[str, Any]]:
+    """Describe the response with a tar archive in the API's schema."""
+    media = {"application/x-tar": {"schema": {"type": "string", "format": "binary"}}}
+    return {200: {"content": media, "description": content}}
+
+
+def tar_response(
+    name: str, made_at: datetime, members: Iterable[tuple[str, int, Iterable[bytes]]]
+) -> StreamingResponse:
+    """Stream a tar archive of files: name, size in bytes, and content."""
+
+    def stream() -> Iterator[bytes]:
+        for member, size_bytes, content in members:
+            entry = tarfile.TarInfo(member)
+            entry.size, entry.mtime = size_bytes, int(made_at.timestamp())
+            yield entry.tobuf(tarfile.GNU_FORMAT)
+            yield from content
+            yield bytes(-size_bytes % tarfile.BLOCKSIZE)
+        yield bytes(2 * tarfile.BLOCKSIZE)
+
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return StreamingResponse(stream(), media_type="application/x-tar", headers=headers)

@@ -126,10 +126,10 @@ class Load:
     def wait_until_whole(self) -> None:
         """Until both workers answer with everything again."""
         deadline = time.monotonic() + BACK_SECONDS
-        for asked in self.workers:
+        for each in self.workers:
             while True:
                 with contextlib.suppress(Unavailable):
-                    answer = asked.search(self.places.request(self.reference, k=100))
+                    answer = each.search(self.places.request(self.reference, k=100))
                     if not answer.missing:
                         assert_answers(answer, self.places.brute_force(VECTOR, 100))
                         break

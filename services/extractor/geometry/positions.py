@@ -44,8 +44,8 @@ def misplaced_photos(
     """Return the names of a model's misplaced photos, and the (m,) matches that led there.
 
     They contradict their coordinates or their best matches, have more matches with one photo that
-    is not in the model than with all that are, or are a block that only looks like the rest. All
-    are misplaced where many contradict their best matches: those of these led there.
+    is not in the model than with all that are, or are a block that only looks like the rest. If
+    many contradict their best matches, the model is bent: all are misplaced, by those matches.
 
     Args:
         is_used: (m,) matches that the model was made of; all tell whether it is right.

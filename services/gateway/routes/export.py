@@ -1,4 +1,4 @@
-"""Route that exports the descriptors of a generation as a tar archive, and archives as responses.
+"""Route that exports the descriptors of a generation as a tar archive.
 
 One archive holds the descriptors and the table of their photos, so that both are from the same
 snapshot. It is streamed with one chunk in memory at a time.
@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
-import tarfile
 import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from sqlalchemy.orm import Session
 
 from services.gateway.authentication import READ
 from services.gateway.dependencies import GatewayDep, GenerationId, MapQuery
+from services.gateway.responses import describe_tar, tar_response
 from shared.catalog.chunks import Descriptor, list_live_chunks
 from shared.catalog.generations import Generation, get_generation
 from shared.catalog.maps import get_map
@@ -48,30 +48,6 @@ PHOTO_COLUMNS = (
     Photo.relative_path,
 )
 CSV_HEADER = ("row", "image_id", *(column.key for column in PHOTO_COLUMNS))
-
-
-def describe_tar(content: str) -> dict[int | str, dict[str, Any]]:
-    """Describe the response with a tar archive in the API's schema."""
-    media = {"application/x-tar": {"schema": {"type": "string", "format": "binary"}}}
-    return {200: {"content": media, "description": content}}
-
-
-def tar_response(
-    name: str, made_at: datetime, members: Iterable[tuple[str, int, Iterable[bytes]]]
-) -> StreamingResponse:
-    """Stream a tar archive of files: name, size in bytes, and content."""
-
-    def stream() -> Iterator[bytes]:
-        for member, size_bytes, content in members:
-            entry = tarfile.TarInfo(member)
-            entry.size, entry.mtime = size_bytes, int(made_at.timestamp())
-            yield entry.tobuf(tarfile.GNU_FORMAT)
-            yield from content
-            yield bytes(-size_bytes % tarfile.BLOCKSIZE)
-        yield bytes(2 * tarfile.BLOCKSIZE)
-
-    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-    return StreamingResponse(stream(), media_type="application/x-tar", headers=headers)
 
 
 @dataclass(frozen=True, slots=True)

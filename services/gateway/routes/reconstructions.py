@@ -17,8 +17,7 @@ from services.gateway.admission import ADMIT_JOB
 from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import GatewayContext, GatewayDep, MapQuery, ReconstructionId
 from services.gateway.idempotency import IdempotentDep, IdempotentRequest
-from services.gateway.responses import JobAcceptedResponse
-from services.gateway.routes.export import describe_tar, tar_response
+from services.gateway.responses import JobAcceptedResponse, describe_tar, tar_response
 from shared.catalog.database.base import get_in_map
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import get_map, lock_map

@@ -84,10 +84,9 @@ def choose_threshold(estimates: Sequence[HeldOutEstimate], certainty: float) -> 
     """Return the lowest probability above which the share `certainty` of the answers is right.
 
     It is at least the probability with MAX_ERROR_FACTOR times the error that is allowed on
-    average, and 0.5: queries may be harder than the samples. Where no sample is, the probabilities
-    themselves count: those above 2 * certainty - 1 are the certainty in the mean if they are evenly
-    distributed. So that is the most if all samples are surer, or too few to tell without being
-    wrong more often; if they are, it is the certainty itself.
+    average, and 0.5: queries may be harder than the samples. Where all samples are surer, or too
+    few to tell, it is at most 2 * certainty - 1: evenly distributed probabilities above that are
+    the certainty in the mean. Where samples above it are wrong more often, it is the certainty.
     """
     # The last level, the whole map, is no answer to where.
     depth = max([1, *(len(s.probabilities) - 1 for s in estimates)])
