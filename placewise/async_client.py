@@ -20,7 +20,6 @@ from placewise.protocol import (
     drop_none,
     open_file,
     printable_name,
-    size_and_sha256,
     to_jsonl,
 )
 from shared.errors import Unavailable, Unprocessable
@@ -53,29 +52,6 @@ class AsyncClient(AsyncTransport):
         """
         data = {name: str(value) for name, value in drop_none(**fields).items()}
         return answers.Uploaded(**await self._send_file("/upload", photo, filename, data=data))
-
-    async def upload_direct(
-        self, /, photo: str | Path, filename: str | None = None, **fields: Any
-    ) -> answers.Uploaded:
-        """Upload a photo directly to the server's bucket with a presigned URL.
-
-        The arguments are those of `upload`; `fields` are JSON values.
-
-        Raises:
-            Conflict: `no_direct_uploads` if the server stores photos in a folder.
-        """
-        with open_file(Path(photo)) as file:
-            size, sha256 = size_and_sha256(file)
-            body = {
-                "filename": filename or printable_name(Path(photo)),
-                "file_size": size,
-                "sha256": sha256,
-                **drop_none(**fields),
-            }
-            presigned = await self._call("POST", "/uploads/presign", json=body)
-            await self._put_presigned(presigned, file)
-        complete_path = presigned["complete_url"].removeprefix(API)
-        return answers.Uploaded(**await self._call("POST", complete_path))
 
     async def upload_files(
         self, photos: Sequence[str | Path], manifest: Sequence[Json] = ()

@@ -68,7 +68,6 @@ class AsyncTransport:
         """
         self.url = validate_url(url, key)
         self._patience = RetryPolicy(patience_seconds)
-        self._timeout_seconds = timeout_seconds
         self._open(
             base_url=self.url,
             timeout=timeout_seconds,
@@ -86,7 +85,7 @@ class AsyncTransport:
         """Close all connections."""
         await self._http.aclose()
 
-    # All that waits is in `aclose` and the next five methods, which the blocking client overrides.
+    # All that waits is in `aclose` and the next four methods, which the blocking client overrides.
 
     def _open(self, **options: Any) -> None:
         self._http = httpx2.AsyncClient(**options)
@@ -96,15 +95,6 @@ class AsyncTransport:
 
     async def _send(self, method: str, url: str, **options: Any) -> httpx2.Response:
         return await self._http.request(method, url, **options)
-
-    async def _send_presigned(self, upload: Json, file: BinaryIO) -> httpx2.Response:
-        async with httpx2.AsyncClient(timeout=self._timeout_seconds) as http:
-            return await http.request(
-                upload["method"],
-                upload["url"],
-                content=_iter_chunks(file),
-                headers=upload["headers"],
-            )
 
     async def _receive(
         self, url: str, write: Callable[[bytes], object], **options: Any
@@ -196,25 +186,15 @@ class AsyncTransport:
 
         await self._retry(attempt)
 
-    async def _put_presigned(self, upload: Json, file: BinaryIO) -> None:
-        """Send a file to a presigned URL, without the API key."""
-
-        async def attempt() -> None:
-            file.seek(0)
-            await self._check(self._send_presigned(upload, file))
-
-        await self._retry(attempt)
-
     async def _check(self, sending: Awaitable[httpx2.Response]) -> httpx2.Response:
         """Await a response; an error response is raised as the matching PlacewiseError."""
         try:
             response = await sending
         except httpx2.TransportError as error:
-            url = error.request.url  # a presigned one is not shown: it is a secret
-            host = self.url if str(url).startswith(self.url) else url.host
             raise Unavailable(
                 "server_unreachable",
-                f"Can't reach Placewise at {host} ({type(error).__name__}). Check that it runs.",
+                f"Can't reach Placewise at {self.url} ({type(error).__name__}). Check that it "
+                "runs.",
             ) from error
         if response.is_success:
             return response
@@ -230,8 +210,3 @@ class AsyncTransport:
                 is_late = time.monotonic() >= deadline
                 await self._sleep(self._patience.wait_seconds(error, attempt, is_late))
                 attempt += 1
-
-
-async def _iter_chunks(file: BinaryIO) -> AsyncIterator[bytes]:
-    while chunk := file.read(CHUNK_BYTES):
-        yield chunk

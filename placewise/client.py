@@ -10,12 +10,12 @@ import copy
 import functools
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from typing import Any, BinaryIO, Concatenate, ParamSpec, Self, TypeVar, cast
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar, cast
 
 import httpx2
 
 from placewise.async_client import AsyncClient, Work
-from placewise.protocol import CHUNK_BYTES, PATIENCE_SECONDS, TIMEOUT_SECONDS, Json, OnWait
+from placewise.protocol import CHUNK_BYTES, PATIENCE_SECONDS, TIMEOUT_SECONDS, OnWait
 
 __all__ = ["Client", "Work"]
 
@@ -34,12 +34,6 @@ class _BlockingCalls(AsyncClient):
 
     async def _send(self, method: str, url: str, **options: Any) -> httpx2.Response:
         return self._blocking_http.request(method, url, **options)
-
-    async def _send_presigned(self, upload: Json, file: BinaryIO) -> httpx2.Response:
-        with httpx2.Client(timeout=self._timeout_seconds) as http:
-            return http.request(
-                upload["method"], upload["url"], content=file, headers=upload["headers"]
-            )
 
     async def _receive(
         self, url: str, write: Callable[[bytes], object], **options: Any
@@ -137,7 +131,6 @@ class Client:
         return other
 
     upload = _blocking(AsyncClient.upload)
-    upload_direct = _blocking(AsyncClient.upload_direct)
     upload_files = _blocking(AsyncClient.upload_files)
     import_objects = _blocking(AsyncClient.import_objects)
     sync_library = _blocking(AsyncClient.sync_library)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import random
@@ -110,12 +109,6 @@ def open_file(file: Path) -> Iterator[BinaryIO]:
 def printable_name(file: Path) -> str:
     """The file's name as text; bytes that are not UTF-8 are replaced."""
     return os.fsencode(file.name).decode("utf-8", "replace")
-
-
-def size_and_sha256(file: BinaryIO) -> tuple[int, str]:
-    """Size in bytes and hexadecimal SHA-256 of a file."""
-    sha256 = hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
-    return file.tell(), sha256
 
 
 def drop_none(**params: Any) -> Json:

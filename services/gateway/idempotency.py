@@ -38,7 +38,6 @@ from shared.catalog.idempotency import StoredResponse, find_response, store_resp
 from shared.errors import PlacewiseError, invalid_field_error
 from shared.ingest.validation import StoredUpload
 from shared.jobs import Job
-from shared.storage import ObjectStore
 
 IDEMPOTENCY_HEADER = "Idempotency-Key"
 REPLAYED_HEADER = "Idempotent-Replayed"
@@ -93,11 +92,15 @@ class IdempotentRequest:
     def begin_form(self, upload: StoredUpload, life_seconds: float = KEY_SECONDS) -> Iterator[None]:
         """As `begin`, with the content of a form; the block executes the request.
 
-        Deletes the received file if the request is refused or was already executed.
+        Deletes the received file if the request is refused or was already executed. Not after other
+        exceptions: after a lost connection the row may have been committed.
         """
-        with delete_if_refused(self._gateway.store, upload.key):
+        try:
             self.begin([upload.filename, upload.sha256, upload.fields], life_seconds)
             yield
+        except (PlacewiseError, IdempotentReplay):
+            self._gateway.store.delete(upload.key)
+            raise
 
     def begin(self, content: Any, life_seconds: float = KEY_SECONDS) -> None:
         """Begin to execute the request, unless that was done before.
@@ -165,19 +168,6 @@ class IdempotentRequest:
         accepted = self.store_job_response(session, job)
         self._response.headers.update(accepted.headers)
         return accepted
-
-
-@contextlib.contextmanager
-def delete_if_refused(store: ObjectStore, key: str) -> Iterator[None]:
-    """Delete a received object if the block refuses the request, or replays a response.
-
-    Not for other exceptions: after a lost connection the row may have been committed.
-    """
-    try:
-        yield
-    except (PlacewiseError, IdempotentReplay):
-        store.delete(key)
-        raise
 
 
 async def _idempotent_form_request(

@@ -1,9 +1,4 @@
-"""Photos of maps, and presigned uploads.
-
-A presigned upload is a photo that a client sends directly to the object store, under a key of its
-own (`shared.storage.keys.incoming_key`), and then completes. Completing copies the object and
-stores its response in the transaction that stores the photo.
-"""
+"""Photos of maps."""
 
 from __future__ import annotations
 
@@ -31,7 +26,7 @@ from shared.catalog.database.base import (
     partial_index,
 )
 from shared.enums import PhotoRole as PhotoRole
-from shared.errors import Gone, NotFound
+from shared.errors import NotFound
 from shared.ids import new_id
 from shared.search_api.photo_filter import is_part_of_tag
 
@@ -296,53 +291,3 @@ def mark_photo_deleted(
             deleted_at=db_now(), purge_at=db_now_plus(kept_days * 86_400), changed_version=version
         )
     )
-
-
-class PresignedUpload(Base):
-    """A presigned upload that is not completed."""
-
-    __tablename__ = "direct_uploads"
-
-    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
-    map_id: Mapped[UUID] = mapped_column(sa.Uuid, sa.ForeignKey("maps.id"))
-    filename: Mapped[str] = mapped_column(sa.Text)
-    size_bytes: Mapped[int] = mapped_column(sa.BigInteger)
-    sha256: Mapped[str] = mapped_column(sa.String(64))
-    photo_fields: Mapped[dict[str, Any]] = mapped_column("said", JsonValue, default=dict)
-    created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
-    expires_at: Mapped[datetime] = mapped_column(UtcDateTime)
-
-    __table_args__ = (
-        sa.Index("ix_direct_uploads_expires_at", "expires_at"),
-        sa.Index("ix_direct_uploads_map", "map_id"),
-    )
-
-
-def get_presigned_upload(
-    session: Session, map_id: UUID, upload_id: UUID, *, lock: bool = False
-) -> PresignedUpload:
-    """Return a presigned upload of the map that is neither completed nor expired.
-
-    Raises:
-        NotFound: `upload_not_found`.
-        Gone: `upload_expired`.
-    """
-    statement = (
-        sa.select(PresignedUpload, (PresignedUpload.expires_at <= db_now()).label("expired"))
-        .where(PresignedUpload.id == upload_id, PresignedUpload.map_id == map_id)
-        .execution_options(populate_existing=True)
-    )
-    row = session.execute(statement.with_for_update() if lock else statement).one_or_none()
-    if row is None:
-        raise NotFound(
-            "upload_not_found",
-            f"There is no upload {upload_id} in this map. Start one: POST /api/v1/uploads/presign.",
-        )
-    upload: PresignedUpload = row[0]
-    if row.expired:
-        raise Gone(
-            "upload_expired",
-            f"The upload {upload_id} expired before it was completed. Start another one: POST "
-            "/api/v1/uploads/presign.",
-        )
-    return upload

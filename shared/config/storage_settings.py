@@ -41,11 +41,6 @@ class StorageSettings(BaseSettings):
     )
     s3_access_key: str | None = Field(None, description="S3 access key ID")
     s3_secret_key: SecretStr | None = Field(None, description="S3 secret access key")
-    s3_public_endpoint: str | None = Field(
-        None,
-        description="URL of the S3 server as clients reach it, for presigned uploads: "
-        "https://photos.example.com; unset: S3_ENDPOINT",
-    )
     s3_bucket: str = Field("placewise", description="S3 bucket, which no other application may use")
     s3_secure: bool = Field(True, description="use HTTPS for S3_ENDPOINT")
     s3_region: str = Field("us-east-1", description="region of S3_BUCKET")
@@ -102,13 +97,6 @@ class StorageSettings(BaseSettings):
                 "10.0.0.5:8333; S3_SECURE selects HTTPS"
             )
         return value
-
-    @field_validator("s3_public_endpoint")
-    @classmethod
-    def _check_base_url(cls, value: str | None) -> str | None:
-        if value is not None and not re.fullmatch(r"https?://[^\s/?#@]+/?", value):
-            raise ValueError("expected a URL without a path, such as https://photos.example.com")
-        return value and value.rstrip("/")
 
     @field_validator("s3_bucket")
     @classmethod

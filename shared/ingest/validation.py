@@ -158,19 +158,15 @@ def validate_photo(
     upload: StoredUpload,
     max_pixels: int,
     key_id: UUID | None = None,
-    fields: PhotoFields | None = None,
 ) -> ValidatedPhoto:
     """Validate a photo's signature, form fields and header.
-
-    Args:
-        fields: The fields of a photo that was announced; None to read those of the form.
 
     Raises:
         UnsupportedMedia: `unsupported_photo`.
         Unprocessable: `invalid_field`, `undecodable_photo`, `too_many_pixels`.
     """
     media_type = check_photo_signature(upload.first_bytes)
-    fields = fields or read_form_fields(upload.fields)
+    fields = read_form_fields(upload.fields)
     with upload.open(store) as file:
         header = read_photo_header(file, max_pixels)
         path = fields.relative_path or upload.filename

@@ -5,7 +5,6 @@
 | keys | contents |
 |---|---|
 | `originals/<uuid>` | an uploaded photo |
-| `incoming/<upload>` | a presigned upload, until it is completed |
 | `checkpoints/<uuid>` | an uploaded checkpoint or COLMAP model, until its job has ended |
 | `models/<sha256>/<uuid>.safetensors` | an added model: its configuration and weights |
 | `thumbnails/<photo>` | a photo's thumbnail, JPEG |
@@ -29,14 +28,7 @@ store, `shared.storage.ownership`) and `.placewise-hold` (garbage collection is 
 """
 
 from shared.storage.folder import FolderStore
-from shared.storage.protocol import (
-    ObjectInfo,
-    ObjectStore,
-    ObjectWriter,
-    OwnedStore,
-    PresignedPut,
-    PresigningStore,
-)
+from shared.storage.protocol import ObjectInfo, ObjectStore, ObjectWriter, OwnedStore
 
 __all__ = [
     "FolderStore",
@@ -44,6 +36,4 @@ __all__ = [
     "ObjectStore",
     "ObjectWriter",
     "OwnedStore",
-    "PresignedPut",
-    "PresigningStore",
 ]

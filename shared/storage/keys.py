@@ -11,7 +11,6 @@ from shared.ids import new_id
 
 OWNER_MARK = ".placewise"  # the note with the id of the owner (`shared.storage.ownership`)
 
-INCOMING = "incoming/"
 CHECKPOINTS = "checkpoints/"
 JOURNAL = "journal/"
 MODELS = "models/"
@@ -78,11 +77,6 @@ def new_original_key(suffix: str = "") -> str:
             that other programs open the files of UPLOAD_DIR.
     """
     return f"{ORIGINALS}{new_id()}{suffix}"
-
-
-def incoming_key(upload_id: UUID) -> str:
-    """Return the key of a presigned upload; completing it copies the object."""
-    return f"{INCOMING}{upload_id}"
 
 
 def is_original_key(key: str) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import BinaryIO, Protocol, runtime_checkable
+from typing import BinaryIO, Protocol
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,15 +17,6 @@ class ObjectInfo:
     size_bytes: int
     modified_at: datetime
     """Time of the write by the store's clock, UTC."""
-
-
-@dataclass(frozen=True, slots=True)
-class PresignedPut:
-    """A presigned PUT request for one object, which needs no credentials."""
-
-    url: str
-    headers: dict[str, str]
-    """Headers that must be sent unchanged: they are part of the signature."""
 
 
 class ObjectWriter(Protocol):
@@ -120,19 +111,6 @@ class OwnedStore(ObjectStore, Protocol):
 
     def delete_note(self, name: str) -> None:
         """Delete the note; a missing one is not an error."""
-
-
-@runtime_checkable
-class PresigningStore(OwnedStore, Protocol):
-    """A store with presigned uploads: a bucket."""
-
-    def presign_put(
-        self, key: str, *, size_bytes: int, sha256: str, expires_seconds: int
-    ) -> PresignedPut:
-        """Return a presigned PUT for an object of this size and SHA-256 (hexadecimal)."""
-
-    def copy(self, source: str, target: str) -> None:
-        """Copy the object to `target`. NotFound when `source` is missing."""
 
 
 def read_up_to(file: BinaryIO, size: int) -> bytes:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator
 
 import pytest
-import urllib3
 
 from placewise.client import Client
 from shared.config.embedded_home import server_address_file
@@ -58,18 +56,6 @@ def test_no_secret_is_logged(server: ServerProcess, s3: S3Server) -> None:
     basic = {"Authorization": f"Basic {made['key']}"}
     assert call.get(f"{API}/jobs", headers=basic).status_code == 401
 
-    data = photo_bytes(2)
-    about = {
-        "filename": "direct.jpg",
-        "file_size": len(data),
-        "sha256": hashlib.sha256(data).hexdigest(),
-    }
-    presigned = call.post(f"{API}/uploads/presign", json=about).json()
-    secrets["presigned signature"] = presigned["url"].partition("X-Amz-Signature=")[2][:64]
-    sent = urllib3.request("PUT", presigned["url"], body=data, headers=presigned["headers"])
-    assert sent.status == 200
-    completed = call.post(presigned["complete_url"]).json()
-    assert server.finished(completed["job_id"])["state"] == "succeeded"
     assert call.delete(f"{API}/keys/{made['id']}").is_success
     assert call.get(f"{API}/jobs", headers=bearer).status_code == 401
     assert server.stop() == 0
@@ -78,7 +64,6 @@ def test_no_secret_is_logged(server: ServerProcess, s3: S3Server) -> None:
     assert f"GET {API}/jobs" in log, "calls are logged, or else this could not tell"
     assert all(len(secret) > 15 for secret in secrets.values()), "or else they may stand by chance"
     assert [name for name, secret in secrets.items() if secret in log] == []
-    assert "X-Amz-Signature" not in log
     stored = b"".join(path.read_bytes() for path in server.home.rglob("*") if path.is_file())
     hashed = {name: secret for name, secret in secrets.items() if name != "webhook"}
     assert [name for name, secret in hashed.items() if secret.encode() in stored] == []

@@ -43,7 +43,6 @@ from shared.storage import FolderStore, ObjectStore
 from shared.storage.copying import copy_object, hash_object
 from shared.storage.keys import (
     IMPORTS,
-    INCOMING,
     JOURNAL,
     ORIGINALS,
     OWNER_MARK,
@@ -62,7 +61,7 @@ COPIED = "copied.jsonl"
 
 # Not backed up: notes of the store, objects that can be recomputed, temporary objects of requests
 # and jobs, and orphans.
-EXCLUDED_PREFIXES = (OWNER_MARK, IMPORTS, INCOMING, QUERIES, PREVIEWS, TRASH)
+EXCLUDED_PREFIXES = (OWNER_MARK, IMPORTS, QUERIES, PREVIEWS, TRASH)
 
 
 @dataclass(frozen=True, slots=True)

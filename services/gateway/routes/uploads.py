@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from fastapi import APIRouter, Request, Response
 from starlette.concurrency import run_in_threadpool
@@ -76,20 +75,18 @@ UPLOAD_FORM = multipart_schema(
     },
 )
 
-UPLOAD_RESPONSES: dict[int | str, dict[str, Any]] = {
-    200: {
-        "model": UploadResponse,
-        "description": "The map already has these bytes, and the photo is searchable.",
-    },
-    201: {"model": UploadResponse, "description": "Searchable (with `Prefer: wait=N`)."},
-}
-
 
 @router.post(
     "/upload",
     operation_id="upload",
     status_code=202,
-    responses=UPLOAD_RESPONSES,
+    responses={
+        200: {
+            "model": UploadResponse,
+            "description": "The map already has these bytes, and the photo is searchable.",
+        },
+        201: {"model": UploadResponse, "description": "Searchable (with `Prefer: wait=N`)."},
+    },
     openapi_extra=UPLOAD_FORM,
     dependencies=[WRITE, CHECK_PHOTO_QUOTA, ADMIT_JOB],
 )
@@ -122,8 +119,11 @@ async def upload_photo(
             stored = await run_in_threadpool(
                 _store_upload, request, gateway, query.map, file, idempotent
             )
-    job = await wait_for_description(request, response, gateway, stored)
-    return UploadOutcome.of(stored, job, query.map).send(response)
+    job = await _wait_for_description(request, response, gateway, stored)
+    outcome = UploadOutcome.of(stored, job, query.map)
+    response.status_code = outcome.status
+    response.headers.update(outcome.headers)
+    return outcome.body
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,14 +158,8 @@ class UploadOutcome:
             return cls(201, {"Location": status_url}, body)
         return cls(202, accepted_headers(status_url), body)
 
-    def send(self, response: Response) -> UploadResponse:
-        """Set the status and the headers of the response, and return its body."""
-        response.status_code = self.status
-        response.headers.update(self.headers)
-        return self.body
 
-
-async def wait_for_description(
+async def _wait_for_description(
     request: Request, response: Response, gateway: GatewayContext, stored: StoreResult
 ) -> Job | None:
     """Return the photo's job, after waiting for its end as long as `Prefer: wait=N` allows."""
@@ -193,16 +187,11 @@ def _store_upload(
             stored = insert_photo(session, map_name, photo)
             outcome = UploadOutcome.of(stored, stored.job, map_name)
             idempotent.store_response(session, outcome.status, outcome.body, outcome.headers)
-    finish_upload(gateway, stored, map_name)
-    return stored
-
-
-def finish_upload(gateway: GatewayContext, stored: StoreResult, map_name: str) -> None:
-    """After the commit: send the job's message, and delete the object that is not used."""
     if stored.queued and stored.job is not None:
         gateway.wakeups.send(JobMessage.of(stored.job, map_name, stored.photo.filename))
     if stored.unused_key is not None:
         gateway.store.delete(stored.unused_key)
+    return stored
 
 
 def _outcome_message(stored: StoreResult, job: Job | None) -> str:

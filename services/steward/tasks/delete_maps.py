@@ -19,7 +19,6 @@ from services.steward.periodic_tasks import periodic_task
 from services.steward.tasks.garbage_collection import (
     ROWS_PER_TRANSACTION,
     delete_chunks,
-    delete_presigned_uploads,
     delete_queries,
     delete_reconstructions,
     delete_with_objects,
@@ -34,7 +33,7 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Evaluation, Generation
 from shared.catalog.jobs import UPLOAD_JOBS, Job, JobKind
 from shared.catalog.maps import CachedMapStatistics, Map, Search
-from shared.catalog.photos import Photo, PresignedUpload
+from shared.catalog.photos import Photo
 from shared.catalog.reconstructions import Reconstruction
 from shared.catalog.tracks import Track, delete_tracks
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
@@ -73,7 +72,6 @@ def _purge_next(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
         lambda: _purge_batches(catalog, store, map_id),
         lambda: delete_reconstructions(catalog, store, reconstructions),
         lambda: _purge_photos(catalog, store, map_id),
-        lambda: delete_presigned_uploads(catalog, store, PresignedUpload.map_id == map_id),
         lambda: _purge_searches(catalog, map_id),
         lambda: _purge_tracks(catalog, map_id),
     )

@@ -26,7 +26,7 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import QUERY_TTL_SECONDS, UNFINISHED_STATES, UPLOAD_JOBS, Job, JobKind
 from shared.catalog.maps import Map, increment_map_version, lock_map
-from shared.catalog.photos import Photo, PresignedUpload
+from shared.catalog.photos import Photo
 from shared.catalog.reconstructions import Reconstruction
 from shared.catalog.tracks import TrackFrame, is_pending
 from shared.catalog.vocabularies import StoredWhitening
@@ -34,12 +34,7 @@ from shared.errors import Unavailable
 from shared.journal.outbox import write_journal
 from shared.storage import ObjectStore
 from shared.storage.chunks import delete_chunk
-from shared.storage.keys import (
-    CHECKPOINTS,
-    derived_image_keys,
-    incoming_key,
-    query_object_keys,
-)
+from shared.storage.keys import CHECKPOINTS, derived_image_keys, query_object_keys
 
 log = logging.getLogger(__name__)
 
@@ -289,25 +284,6 @@ def collect_queries(catalog: Catalog, store: ObjectStore, ttl_seconds: float) ->
     delete_queries(catalog, store, is_old, ~awaited_by_frame)
 
 
-def delete_presigned_uploads(catalog: Catalog, store: ObjectStore, condition: Condition) -> bool:
-    """Delete presigned uploads with the objects uploaded for them; return if there were any."""
-    return delete_with_objects(
-        catalog,
-        store,
-        select(PresignedUpload.id).where(condition).limit(ROWS_PER_TRANSACTION),
-        lambda upload_id: [incoming_key(upload_id)],
-        lambda session, ids: session.execute(
-            # Checked again: the upload may have been completed since it was selected.
-            delete(PresignedUpload).where(PresignedUpload.id.in_(ids), condition)
-        ),
-    )
-
-
-def collect_presigned_uploads(catalog: Catalog, store: ObjectStore) -> None:
-    """Delete presigned uploads that expired."""
-    delete_presigned_uploads(catalog, store, PresignedUpload.expires_at < db_now())
-
-
 def collect_checkpoints(catalog: Catalog, store: ObjectStore) -> None:
     """Delete uploaded checkpoints and COLMAP models whose jobs have ended.
 
@@ -344,5 +320,4 @@ def collect_garbage(
     collect_reconstructions(catalog, store, retired_grace_seconds)
     collect_deleted_photos(catalog, store, retired_grace_seconds)
     collect_queries(catalog, store, query_ttl_seconds)
-    collect_presigned_uploads(catalog, store)
     collect_checkpoints(catalog, store)

@@ -28,7 +28,7 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.installation import check_not_behind
 from shared.catalog.jobs import UNFINISHED_STATES, UPLOAD_JOBS, Job, JobKind, JobState
 from shared.catalog.models import Model
-from shared.catalog.photos import Photo, PresignedUpload, is_kept
+from shared.catalog.photos import Photo, is_kept
 from shared.catalog.reconstructions import Reconstruction
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.errors import Conflict
@@ -36,7 +36,6 @@ from shared.storage import ObjectStore, OwnedStore
 from shared.storage.chunks import codes_key, features_key, manifest_key
 from shared.storage.keys import (
     CHECKPOINTS,
-    INCOMING,
     MODELS,
     ORIGINALS,
     PREVIEWS,
@@ -47,7 +46,6 @@ from shared.storage.keys import (
     VOCABULARIES,
     WHITENINGS,
     derived_image_keys,
-    incoming_key,
     is_original_key,
     query_object_keys,
 )
@@ -210,16 +208,6 @@ def _referenced_checkpoints(session: Session, keys: list[str]) -> Iterable[str]:
     return [key for params in unfinished if (key := params["object_key"]) is not None]
 
 
-def _referenced_incoming(session: Session, keys: list[str]) -> Iterable[str]:
-    """Keys of presigned uploads that are not completed.
-
-    An object of a completed upload was sent again while its URL was still valid.
-    """
-    upload_ids = _parse_uuids(key.removeprefix(INCOMING) for key in keys)
-    waiting = session.scalars(select(PresignedUpload.id).where(PresignedUpload.id.in_(upload_ids)))
-    return [incoming_key(upload_id) for upload_id in waiting]
-
-
 def _referenced_derived_images(session: Session, keys: list[str]) -> Iterable[str]:
     photo_ids = _parse_uuids(key.rpartition("/")[2].removesuffix(".jpg") for key in keys)
     kept = session.scalars(select(Photo.id).where(Photo.id.in_(photo_ids), is_kept()))
@@ -272,7 +260,6 @@ def _parse_uuids(names: Iterable[str]) -> set[UUID]:
 
 # Prefix -> which of the keys under it a catalog row refers to; more keys may be returned.
 REFERENCED_BY_PREFIX: dict[str, Callable[[Session, list[str]], Iterable[str]]] = {
-    INCOMING: _referenced_incoming,
     CHECKPOINTS: _referenced_checkpoints,
     MODELS: _referenced_by_column(Model.object_key),
     ORIGINALS: _referenced_originals,

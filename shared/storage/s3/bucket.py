@@ -15,10 +15,8 @@ from xml.etree.ElementTree import ParseError
 import urllib3
 from minio import Minio
 from minio.commonconfig import ENABLED, Filter
-from minio.credentials.credentials import Credentials
 from minio.credentials.providers import StaticProvider
 from minio.error import MinioException, S3Error
-from minio.helpers import BaseURL
 from minio.lifecycleconfig import AbortIncompleteMultipartUpload, LifecycleConfig, Rule
 from urllib3.connectionpool import ConnectionPool
 from urllib3.exceptions import (
@@ -99,10 +97,6 @@ class Bucket:
     client: Minio
     name: str
     endpoint: str
-    region: str
-    credentials: Credentials
-    public: BaseURL
-    """The server's URL for clients of Placewise."""
     settings: Settings
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -144,18 +138,7 @@ class Bucket:
             region=settings.s3_region,  # without it the client would request it first
             http_client=connections,
         )
-        public = settings.s3_public_endpoint or (
-            f"{'https' if settings.s3_secure else 'http'}://{settings.s3_endpoint}"
-        )
-        return cls(
-            client,
-            settings.s3_bucket,
-            settings.s3_endpoint,
-            settings.s3_region,
-            credentials.retrieve(),
-            BaseURL(public, settings.s3_region),
-            settings,
-        )
+        return cls(client, settings.s3_bucket, settings.s3_endpoint, settings)
 
     @contextlib.contextmanager
     def translate_errors(self, key: str | None = None) -> Iterator[None]:

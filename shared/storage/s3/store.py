@@ -1,31 +1,19 @@
-"""The object store in a bucket, and presigned uploads. Several processes may share a bucket.
-
-A presigned PUT is a URL that allows uploading one object for a limited time. It uses AWS Signature
-Version 4 in the query (docs.aws.amazon.com, "Authenticating Requests: Using Query Parameters").
-`Minio.presigned_put_object` signs only the host. Here size and checksum are signed too, so that a
-server that verifies them accepts no other content; not every server does, hence the caller checks
-what was stored.
-"""
+"""The object store in a bucket. Several processes may share a bucket."""
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import io
 from collections.abc import Iterator
-from datetime import UTC, datetime
+from datetime import UTC
 from pathlib import Path
 from typing import BinaryIO
 
-from minio import signer
-from minio.commonconfig import REPLACE, CopySource
+from minio.commonconfig import CopySource
 from minio.error import S3Error
-from minio.helpers import queryencode
-from minio.time import to_amz_date
 
 from shared.errors import NotFound
 from shared.storage.keys import check_key, check_note_name
-from shared.storage.protocol import ObjectInfo, PresignedPut
+from shared.storage.protocol import ObjectInfo
 from shared.storage.s3.bucket import NO_SUCH_KEY_CODES, Bucket
 from shared.storage.s3.streams import MultipartUpload, S3Reader, S3Writer, read_range
 
@@ -104,56 +92,11 @@ class S3Store:
                 modified_at = listed.last_modified.astimezone(UTC).replace(microsecond=0)
                 yield ObjectInfo(key, listed.size or 0, modified_at)
 
-    def presign_put(
-        self, key: str, *, size_bytes: int, sha256: str, expires_seconds: int
-    ) -> PresignedPut:
-        bucket, now = self.bucket, datetime.now(UTC)
-        url = bucket.public.build(
-            method="PUT", region=bucket.region, bucket_name=bucket.name, object_name=check_key(key)
-        )
-        checksum = base64.b64encode(bytes.fromhex(sha256)).decode()
-        signed = {
-            "content-length": str(size_bytes),
-            "host": url.netloc,
-            "x-amz-checksum-sha256": checksum,
-        }
-        credential = signer.get_credential_string(bucket.credentials.access_key, now, bucket.region)
-        parameters = {
-            "X-Amz-Algorithm": signer.SIGN_V4_ALGORITHM,
-            "X-Amz-Credential": credential,
-            "X-Amz-Date": to_amz_date(now),
-            "X-Amz-Expires": str(expires_seconds),
-            "X-Amz-SignedHeaders": ";".join(signed),
-        }
-        query = "&".join(f"{name}={queryencode(value)}" for name, value in parameters.items())
-        header_lines = "".join(f"{name}:{value}\n" for name, value in signed.items())
-        canonical_request = (
-            f"PUT\n{url.path}\n{query}\n{header_lines}\n{';'.join(signed)}\nUNSIGNED-PAYLOAD"
-        )
-        scope = credential.removeprefix(f"{bucket.credentials.access_key}/")
-        request_hash = hashlib.sha256(canonical_request.encode()).hexdigest()
-        signature = signer.post_presign_v4(
-            f"{signer.SIGN_V4_ALGORITHM}\n{to_amz_date(now)}\n{scope}\n{request_hash}",
-            bucket.credentials.secret_key,
-            now,
-            bucket.region,
-        )
-        headers = {"Content-Length": str(size_bytes), "x-amz-checksum-sha256": checksum}
-        return PresignedPut(
-            f"{url._replace(query=query).geturl()}&X-Amz-Signature={signature}", headers
-        )
-
-    def copy(self, source: str, target: str) -> None:
+    def move(self, source: str, target: str) -> None:
         client, bucket = self.bucket.client, self.bucket.name
         check_key(source), check_key(target)
         with self.bucket.translate_errors(source):
-            # The uploader's metadata (content type, encoding) is not copied.
-            client.copy_object(
-                bucket, target, CopySource(bucket, source), metadata_directive=REPLACE
-            )
-
-    def move(self, source: str, target: str) -> None:
-        self.copy(source, target)
+            client.copy_object(bucket, target, CopySource(bucket, source))
         self.delete(source)
 
     def free_trash(self, min_free_bytes: int) -> int:

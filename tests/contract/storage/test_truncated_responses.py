@@ -28,7 +28,7 @@ CALLS: dict[str, tuple[Callable[[S3Store], object], int]] = {
     "head": (lambda store: store.head(KEY), 0),
     "head of nothing": (lambda store: store.head("nothing"), 0),
     "list": (lambda store: [found.key for found in store.list("a/")], 200),
-    "copy": (lambda store: store.copy(KEY, "copied"), 100),
+    "move": (lambda store: _put_and_move(store), 100),
     "delete": (lambda store: store.delete("gone"), 0),
     "check": (lambda store: store.check(), 0),
 }
@@ -63,6 +63,11 @@ def test_answer_whose_body_is_cut_is_no_answer(
     assert set(codes) == {"object_store_unavailable", None}
     body = codes[: len(codes) - came][len(codes) - came - body_bytes // STEP_BYTES :]
     assert set(body) <= {"object_store_unavailable"}
+
+
+def _put_and_move(store: S3Store) -> None:
+    store.put(KEY, BODY)
+    store.move(KEY, "moved")
 
 
 def _outcome(call: Callable[[S3Store], object], store: S3Store) -> tuple[object, str | None]:

@@ -21,6 +21,7 @@ from tests.support.problems import problem
 from tools.make_api_page import openapi_description
 
 IMPORT = "/reconstructions/import"
+PHOTO = "/uploads/01a1fca4-c1a2-7356-bf32-75e1cb64beb1"
 BOUNDED_FORMATS = {"binary", "date-time", "duration", "uuid"}
 CAMERA = {"model": "PINHOLE", "width": 9, "height": 9, "params": [9, 9, 4, 4]}
 POSE = {"camera": 0, "rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}
@@ -81,8 +82,8 @@ def test_no_list_text_or_object_of_a_request_body_is_without_a_limit() -> None:
         ("POST", IMPORT, {f"field{number}": 0 for number in range(50_000)}),
         ("POST", IMPORT, {"cameras": [CAMERA], "photos": [{**POSE, "x" * 90_000: 1}] * 3}),
         ("POST", "/positions", {"photos": [{}] * 9_000, "track": [{}] * 9_000}),
-        ("POST", "/uploads/presign", {"tags": [1] * 50_000}),
-        ("POST", "/uploads/presign", {"metadata": {str(number): 0 for number in range(20_000)}}),
+        ("PATCH", PHOTO, {"tags": [1] * 50_000}),
+        ("PATCH", PHOTO, {"metadata": {str(number): 0 for number in range(20_000)}}),
         ("POST", "/maps", {f"field{number}": 0 for number in range(90)}),
     ],
 )
@@ -98,7 +99,7 @@ def test_a_body_of_more_values_than_its_size_needs_is_refused_before_it_is_parse
     door: Door,
 ) -> None:
     for body in (b"[" * 70_000, b'{"tags":[' + b"1," * 70_000 + b"1]}", b"{}," * 40_000):
-        answer = door(ADMIN, "POST", "/uploads/presign", content=body)
+        answer = door(ADMIN, "PATCH", PHOTO, content=body)
         problem(answer, 413, "too_many_values")
 
 

@@ -22,11 +22,10 @@ from services.steward.tasks.model_changes import advance_model_changes
 from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk
-from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import cache_map_statistics
-from shared.catalog.photos import Photo, PresignedUpload
+from shared.catalog.photos import Photo
 from shared.config.settings import Settings
 from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
 from shared.jobs import InProcessWakeups, Job, JobKind
@@ -93,16 +92,6 @@ def live_in(service: Service, name: str) -> None:
         made = add_reconstruction(session, service.store, active)
         made.job_id, made.finished_at = job.id, None
         service.store.put(job.params["object_key"], b"a COLMAP model")
-        session.add(  # which takes a bucket otherwise
-            PresignedUpload(
-                map_id=id_of(service, name),
-                filename="sent.jpg",
-                size_bytes=1,
-                sha256="0" * 64,
-                photo_fields={},
-                expires_at=db_now_plus(3600),
-            )
-        )
 
 
 def finish_changes(service: Service) -> None:

@@ -20,11 +20,11 @@ from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import GenerationState
 from shared.catalog.idempotency import StoredResponse
-from shared.catalog.photos import Photo, PresignedUpload
+from shared.catalog.photos import Photo
 from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups, Job, JobKind, JobState
 from shared.storage import FolderStore
-from shared.storage.keys import incoming_key, new_original_key
+from shared.storage.keys import new_original_key
 from tests.integration.steward.chunk_map import HOUR_SECONDS, ChunkMap
 from tests.integration.steward.test_compaction import sum_of
 from tests.integration.steward.test_garbage_collection import add_one_job
@@ -159,16 +159,6 @@ def test_the_loop_runs_each_task(
                 expires_at=db_now_plus(-1),
             )
         )
-        forgotten = PresignedUpload(
-            map_id=chunk_map.map_id,
-            filename="a.jpg",
-            size_bytes=1,
-            sha256="0" * 64,
-            expires_at=db_now_plus(-1),
-        )
-        session.add(forgotten)
-        session.flush()
-    chunk_map.store.put(incoming_key(forgotten.id), b"never completed")
     steward = Scheduler(chunk_map.catalog, chunk_map.store, wakeups, soon)
     stop = threading.Event()
 
@@ -180,12 +170,10 @@ def test_the_loop_runs_each_task(
     steward.run(stop)
     assert chunk_map.live() == [COMPACT_CHUNKS]
     assert chunk_map.objects("originals/") == set()
-    assert chunk_map.objects("incoming/") == set()
     assert wakeups.wait(0)
     chunk_map.check_rows(retained)
     with chunk_map.catalog.read() as session:
         assert session.scalars(select(StoredResponse.id)).all() == []
-        assert session.scalars(select(PresignedUpload.id)).all() == []
         assert session.get_one(Job, lost).state == JobState.QUEUED
         fit = session.scalars(select(Job).where(Job.kind == JobKind.FIT)).one()
         assert fit.map_id == other

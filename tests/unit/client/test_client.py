@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -261,38 +259,3 @@ def test_permanent_errors_are_not_retried(
         client.stats()
     assert len(server.requests) == 1
     assert slept == []
-
-
-def test_a_direct_upload_announces_sends_and_completes(
-    server: FakeServer, photo: Path, slept: list[float]
-) -> None:
-    """The bytes go where the server says, without the key that only the server may see."""
-    server.will_answer(
-        201,
-        {
-            "method": "PUT",
-            "url": f"{server.url}/bucket/incoming/1?X-Amz-Signature=abc",
-            "headers": {"Content-Length": str(photo.stat().st_size), "x-amz-checksum-sha256": "="},
-            "complete_url": "/api/v1/uploads/presign/1/complete",
-        },
-    )
-    server.will_answer(503, b"<Error><Code>SlowDown</Code></Error>")
-    server.will_answer(200, b"")
-    server.will_answer(202, UPLOADED)
-    with Client(server.url, map="lab", key="secret", patience_seconds=60) as client:
-        assert client.upload_direct(photo, latitude=45.5, place=None).as_json() == UPLOADED
-    announced, *sent, completed = server.requests
-    assert announced[1] == "/api/v1/uploads/presign?map=lab"
-    assert json.loads(announced[2]) == {
-        "filename": "street.jpg",
-        "file_size": photo.stat().st_size,
-        "sha256": hashlib.sha256(photo.read_bytes()).hexdigest(),
-        "latitude": 45.5,
-    }
-    for (method, path, body), headers in zip(sent, server.headers[1:3], strict=True):
-        assert (method, path) == ("PUT", "/bucket/incoming/1?X-Amz-Signature=abc")
-        assert body == photo.read_bytes()
-        assert headers["x-amz-checksum-sha256"] == "="
-        assert headers.get("Authorization") is None
-    assert completed[:2] == ("POST", "/api/v1/uploads/presign/1/complete?map=lab")
-    assert len(slept) == 1

@@ -156,27 +156,5 @@ def test_asynchronous_client_uploads_waits_and_lists(server: FakeServer, tmp_pat
     assert {headers.get("Authorization") for headers in server.headers} == {"Bearer secret"}
 
 
-def test_asynchronous_client_sends_a_direct_upload_in_pieces(
-    server: FakeServer, tmp_path: Path
-) -> None:
-    path = tmp_path / "street.jpg"
-    path.write_bytes(b"x" * 700_000)
-    headers = {"Content-Length": "700000"}
-    put = {"method": "PUT", "url": f"{server.url}/bucket/1", "headers": headers}
-    server.will_answer(201, {**put, "complete_url": "/api/v1/uploads/presign/1/complete"})
-    server.will_answer(200, b"")
-    server.will_answer(404, placewise.NotFound("upload_not_found", "None.").as_problem())
-
-    async def use() -> None:
-        async with placewise.connect_async(server.url) as places:
-            await places.upload_direct(path)
-
-    with pytest.raises(placewise.NotFound) as caught:
-        asyncio.run(use())
-    assert caught.value.code == "upload_not_found"
-    assert server.requests[1] == ("PUT", "/bucket/1", path.read_bytes())
-    assert json.loads(server.requests[0][2])["file_size"] == 700_000
-
-
 def test_package_says_that_it_is_typed() -> None:
     assert Path(placewise.__file__).with_name("py.typed").is_file()

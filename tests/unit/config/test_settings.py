@@ -125,9 +125,6 @@ def test_s3_uses_https_with_a_bucket_of_its_own_by_default(
         ({"S3_ENDPOINT": "http://s3:8333"}, "S3_SECURE selects HTTPS"),
         ({"S3_ENDPOINT": "s3:8333/placewise"}, "without a scheme"),
         ({"S3_BUCKET": "Photos"}, "lower-case letters"),
-        ({"S3_PUBLIC_ENDPOINT": "photos.example.com"}, "https://photos.example.com"),
-        ({"S3_PUBLIC_ENDPOINT": "https://photos.example.com/bucket"}, "without a path"),
-        ({"S3_PUBLIC_ENDPOINT": "https://key@photos.example.com"}, "without a path"),
         ({"UPLOAD_DIR": "./uploads"}, "Unset one of the two"),
     ],
 )
