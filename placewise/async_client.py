@@ -302,8 +302,6 @@ class AsyncClient(AsyncTransport):
                     "job_unfinished",
                     f"The job {job.job_id} is still {job.state} after {timeout_seconds:g} s.",
                 )
-            if job.waiting_for:
-                await self._sleep(1.0)  # the server does not hold long polls of such jobs
 
     async def wait(
         self,

@@ -41,7 +41,6 @@ RETRY_TARGET_SHARE = 0.9  # Retry-After: when the queue has shrunk to this share
 MAX_RETRY_SECONDS = 60
 UNKNOWN_RATE_RETRY_SECONDS = 5  # Retry-After while no job has finished within the last minute
 UPLOAD_RETRY_SECONDS = 1
-STREAM_RETRY_SECONDS = 10  # event streams last as long as their jobs
 MAX_SMOOTHED_TRACKS = 2  # at the same time: each competes with all other requests for the CPU
 SMOOTHING_RETRY_SECONDS = 2
 
@@ -134,12 +133,6 @@ class AdmissionControl:
             )
             for kind in UploadKind
         }
-        self.event_streams = _ConcurrencyLimit(
-            "event streams (a quarter of MAX_CONNECTIONS)",
-            "too_many_event_streams",
-            total=settings.max_connections // 4,  # each occupies one as long as its job runs
-            retry_after_seconds=STREAM_RETRY_SECONDS,
-        )
         self.smoothed_tracks = _ConcurrencyLimit(
             "requests for smoothed tracks",
             "too_many_smoothed_tracks",

@@ -1,7 +1,7 @@
 """Dependencies of the routes: `GatewayContext`, path and query parameters, and the job notifier.
 
-`JobNotifier` implements long polling (`Prefer: wait=N`, `?wait=N`) and the event streams. It polls
-the job table once for all waiting requests, so it can poll often without loading the database.
+`JobNotifier` implements long polling (`Prefer: wait=N`, `?wait=N`). It polls the job table once for
+all waiting requests, so it can poll often without loading the database.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import math
 import re
 import threading
 import time
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, TypeVar
 from uuid import UUID
@@ -36,39 +36,22 @@ from shared.search_api.protocol import SearchBackend
 from shared.storage import OwnedStore
 
 MAX_WAIT_SECONDS = 60.0  # of `Prefer: wait` and `?wait=`
-NOTIFIER_POLL_SECONDS = 0.02  # poll interval while a request waits for the end of a job
-CHANGE_POLL_SECONDS = 0.25  # poll interval while requests wait only for changes of jobs
+NOTIFIER_POLL_SECONDS = 0.02
 POLL_COST_DIVISOR = 2  # at most a third of the time is spent polling: slow polls become rare
 MAX_POLL_PAUSE_SECONDS = 1.0  # after a slow poll: the jobs of waiting requests may have ended
 # Requests may wait this long after the shutdown has begun. Most queries end within this time.
 SHUTDOWN_WAIT_SECONDS = 5.0
 CACHED_RANKINGS = 1000  # of about 50 photos: 20 MB
 
-# The columns that show a job's progress. Only these are polled: it happens often, for many jobs.
-WATCHED_COLUMNS = (
-    Job.state,
-    Job.stage,
-    Job.waiting_for,
-    Job.awaited,
-    Job.progress_done,
-    Job.progress_total,
-    Job.progress_failed,
-    Job.attempts,
-)
-WatchedState = tuple[Any, ...]
-"""The values of WATCHED_COLUMNS; () for a job that the caller has not seen yet."""
-
 
 @dataclass(eq=False, slots=True)
 class _Waiter:
     job_id: UUID
-    last_seen: WatchedState | None
-    """The state that the request knows; None if it waits for the end of the job."""
-    future: asyncio.Future[WatchedState | None]
+    future: asyncio.Future[None]
 
 
 class JobNotifier:
-    """Notifies requests of the changes and the end of jobs.
+    """Notifies requests of the end of jobs.
 
     Must be used from one event loop. Polls only while requests are waiting.
     """
@@ -83,13 +66,8 @@ class JobNotifier:
         self._shutdown_deadline = math.inf
 
     def begin_shutdown(self) -> None:
-        """Release the waiting requests before the server stops.
-
-        Those that wait for a change are released now, those that wait for the end of a job after
-        `shutdown_wait_seconds` at the latest.
-        """
+        """Release the waiting requests after `shutdown_wait_seconds` at the latest."""
         self._shutdown_deadline = time.monotonic() + self._shutdown_wait_seconds
-        _release(waiter for waiter in self._waiters if waiter.last_seen is not None)
 
     async def wait_until_finished(self, job_id: UUID, seconds: float) -> None:
         """Wait until the job has ended or been deleted, at most `seconds`.
@@ -98,36 +76,14 @@ class JobNotifier:
             SQLAlchemyError: The catalog can't be reached.
         """
         timeout = min(seconds, self._shutdown_deadline - time.monotonic())
-        try:
-            await self._wait(job_id, None, timeout)
-        except TimeoutError:
-            return
-
-    async def wait_for_change(
-        self, job_id: UUID, last_seen: WatchedState, seconds: float
-    ) -> WatchedState | None:
-        """Wait until the state of the job differs from `last_seen`.
-
-        Returns:
-            The new state; None if the job was deleted or the server is stopping.
-
-        Raises:
-            TimeoutError: The job has not changed within `seconds`.
-            SQLAlchemyError: The catalog can't be reached.
-        """
-        if self._shutdown_deadline < math.inf:
-            return None
-        return await self._wait(job_id, last_seen, seconds)
-
-    async def _wait(
-        self, job_id: UUID, last_seen: WatchedState | None, seconds: float
-    ) -> WatchedState | None:
-        waiter = _Waiter(job_id, last_seen, asyncio.get_running_loop().create_future())
+        waiter = _Waiter(job_id, asyncio.get_running_loop().create_future())
         self._waiters.add(waiter)
         if self._poll_task is None:
             self._poll_task = asyncio.create_task(self._poll_while_awaited())
         try:
-            return await asyncio.wait_for(waiter.future, seconds)
+            await asyncio.wait_for(waiter.future, timeout)
+        except TimeoutError:
+            return
         finally:
             self._waiters.discard(waiter)
 
@@ -139,52 +95,34 @@ class JobNotifier:
                 started = time.monotonic()
                 await self._poll(started)
                 elapsed = time.monotonic() - started
-                awaits_end = any(waiter.last_seen is None for waiter in self._waiters)
-                interval = NOTIFIER_POLL_SECONDS if awaits_end else CHANGE_POLL_SECONDS
-                pause = max(interval, min(POLL_COST_DIVISOR * elapsed, MAX_POLL_PAUSE_SECONDS))
+                pause = min(POLL_COST_DIVISOR * elapsed, MAX_POLL_PAUSE_SECONDS)
+                pause = max(NOTIFIER_POLL_SECONDS, pause)
         finally:
             self._poll_task = None
 
     async def _poll(self, now: float) -> None:
-        """Wake the waiters whose jobs have ended or changed."""
+        """Wake the waiters whose jobs have ended or are gone; all of them after the shutdown."""
         waiters = set(self._waiters)
         if not waiters:
             return
         try:
             job_ids = {waiter.job_id for waiter in waiters}
-            states = await run_in_threadpool(_load_watched_states, self._catalog, job_ids)
+            unfinished = await run_in_threadpool(_find_unfinished, self._catalog, job_ids)
         except Exception as error:  # raised by the waiting requests
             for waiter in waiters:
                 if not waiter.future.done():
                     waiter.future.set_exception(error)
             return
         for waiter in waiters:
-            state = states.get(waiter.job_id)
-            if _is_ready(waiter, state) and not waiter.future.done():
-                waiter.future.set_result(state)
-        if now >= self._shutdown_deadline:
-            _release(self._waiters)
+            is_over = waiter.job_id not in unfinished or now >= self._shutdown_deadline
+            if is_over and not waiter.future.done():
+                waiter.future.set_result(None)
 
 
-def _release(waiters: Iterable[_Waiter]) -> None:
-    for waiter in waiters:
-        if not waiter.future.done():
-            waiter.future.set_result(None)
-
-
-def _is_ready(waiter: _Waiter, state: WatchedState | None) -> bool:
-    """Whether the job has ended or changed; `state` is None for a deleted job."""
-    if state is None:
-        return True
-    if waiter.last_seen is None:
-        return state[0] not in UNFINISHED_STATES
-    return state != waiter.last_seen
-
-
-def _load_watched_states(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, WatchedState]:
+def _find_unfinished(catalog: Catalog, job_ids: set[UUID]) -> set[UUID]:
+    unfinished = select(Job.id).where(Job.id.in_(job_ids), Job.state.in_(UNFINISHED_STATES))
     with catalog.read() as session:
-        rows = session.execute(select(Job.id, *WATCHED_COLUMNS).where(Job.id.in_(job_ids)))
-        return {row[0]: tuple(row[1:]) for row in rows}
+        return set(session.scalars(unfinished))
 
 
 API_PREFIX = "/api/v1"

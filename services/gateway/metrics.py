@@ -83,7 +83,7 @@ class GatewayMetrics:
         )
         self._in_flight = Gauge(
             "requests_under_way",
-            "Requests in flight, including event streams.",
+            "Requests in flight.",
             namespace=METRIC_PREFIX,
             registry=registry,
         )
@@ -130,8 +130,6 @@ class _LoadCollector(Collector):
             receiving.add_metric([kind.name.lower()], self._admission.active_uploads(kind))
         yield receiving
         yield _gauge("connections", "Open connections.", value=self._connections.count)
-        streams = self._admission.event_streams.count
-        yield _gauge("event_streams", "Open event streams.", value=streams)
         closed = CounterMetricFamily(
             f"{METRIC_PREFIX}_connections_closed",
             "Connections refused or closed because of a limit.",

@@ -38,8 +38,7 @@ class GatewaySettings(BaseSettings):
     max_connections: int = Field(
         2000,
         ge=1,
-        description="open connections of one server, a quarter of them event streams "
-        "(GET /jobs/ID/events); fewer where the limit of open files is lower",
+        description="open connections of one server; fewer where the limit of open files is lower",
     )
     max_connections_per_address: int = Field(
         200,

@@ -1,4 +1,4 @@
-"""Photos in: one by one, in batches, refused ones named, and watched without events."""
+"""Photos in: one by one, in batches, and refused ones named."""
 
 from __future__ import annotations
 
@@ -172,12 +172,6 @@ def test_an_archive_that_the_page_can_not_read_says_what_to_do(page: Page) -> No
     flags = whole.index(b"PK\x01\x02") + 8
     add(page, archive("locked.zip", whole[:flags] + b"\x01" + whole[flags + 1 :]))
     expect(page.locator(".queue-row.failed .errors")).to_contain_text("can't be read, 1.jpg")
-
-
-def test_a_job_is_polled_where_events_do_not_arrive(page: Page, city: CityServer) -> None:
-    page.route("**/events*", lambda route: route.abort())
-    add(page, photo(1))
-    expect(page.locator(".queue-row.done .state")).to_have_text("Searchable")
 
 
 def test_a_lost_connection_is_shown_and_the_photo_sent_again(page: Page, city: CityServer) -> None:

@@ -160,7 +160,6 @@ def test_what_belongs_to_one_map_is_not_found_in_another(server: ServerProcess) 
         problem(answer, 404, "photo_not_found")
     for method, path in (
         ("GET", ""),
-        ("GET", "/events"),
         ("GET", "/result"),
         ("POST", "/cancel"),
         ("POST", "/retry"),

@@ -1,20 +1,17 @@
-"""Routes of `/jobs`: status, long polling, event streams, cancel and retry."""
+"""Routes of `/jobs`: status, long polling, cancel and retry."""
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import Sequence
 from typing import Annotated
 from uuid import UUID
 
-from fastapi import APIRouter, Depends, Query, Request
-from fastapi.responses import StreamingResponse
+from fastapi import APIRouter, Query
 from pydantic import Field
-from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from services.gateway.admission import ADMIT_JOB, AdmissionDep
+from services.gateway.admission import ADMIT_JOB
 from services.gateway.authentication import READ, WRITE
 from services.gateway.dependencies import (
     MAX_WAIT_SECONDS,
@@ -24,13 +21,11 @@ from services.gateway.dependencies import (
     MapPageParams,
     MapParams,
     MapQuery,
-    find_job,
     load_job_of_map,
     wait_for_job,
 )
 from services.gateway.idempotency import IdempotentDep
 from services.gateway.responses import JobResponse, JobsResponse
-from shared.catalog.database.errors import to_unavailable
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, UNFINISHED_STATES, get_job, list_jobs
 from shared.catalog.maps import get_map
 from shared.jobs import Job, JobKind, JobState
@@ -39,9 +34,6 @@ from shared.jobs.transitions import cancel_batch, cancel_job, retry_batch, retry
 from shared.jobs.wakeups import read_job_messages, report_jobs
 
 router = APIRouter(tags=["jobs"])
-
-CATALOG_RETRY_SECONDS = 1.0  # between two polls while the catalog is unreachable
-HEARTBEAT_SECONDS = 15.0  # interval of comment lines, so that proxies do not close idle streams
 
 
 class JobsParams(MapPageParams):
@@ -91,35 +83,6 @@ def _job_response(gateway: GatewayContext, job: Job, map_name: str) -> JobRespon
         return JobResponse.of(job, map_name, _read_filenames(session, [job]).get(job.id))
 
 
-async def _hold_event_stream(request: Request, admission: AdmissionDep) -> AsyncIterator[None]:
-    """Dependency that counts an event stream until its response has ended."""
-    with admission.event_streams.hold(request):
-        yield
-
-
-@router.get(
-    "/jobs/{job_id}/events",
-    operation_id="job_events",
-    response_class=StreamingResponse,
-    responses={200: {"content": {"text/event-stream": {}}, "description": "`progress` events"}},
-    dependencies=[READ, Depends(_hold_event_stream, scope="request")],
-)
-async def stream_job_events(
-    gateway: GatewayDep, job_id: JobId, query: MapQuery
-) -> StreamingResponse:
-    """Stream server-sent events: a `progress` event with the job at every change, until it ends.
-
-    If too many streams are open (429, `too_many_event_streams`), poll the job instead.
-    """
-    job = await run_in_threadpool(load_job_of_map, gateway, query.map, job_id)
-    response = await run_in_threadpool(_job_response, gateway, job, query.map)
-    return StreamingResponse(
-        _events(gateway, job_id, response, query.map),
-        media_type="text/event-stream",
-        headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
-    )
-
-
 @router.post("/jobs/{job_id}/cancel", operation_id="cancel_job", dependencies=[WRITE])
 def cancel_job_by_id(
     gateway: GatewayDep, job_id: JobId, idempotent: IdempotentDep, query: MapQuery
@@ -164,33 +127,3 @@ def retry_job_by_id(
     report_jobs(gateway.catalog, gateway.wakeups, [job.id])
     gateway.wakeups.send(*messages)
     return response
-
-
-async def _events(
-    gateway: GatewayContext, job_id: UUID, job: JobResponse, map_name: str
-) -> AsyncIterator[str]:
-    """Yield the event stream of a job, beginning with its current state `job`."""
-    number, last_seen, sent = 0, (), ""
-    while True:
-        if (text := job.model_dump_json()) != sent:
-            sent, number = text, number + 1
-            yield f"id: {number}\nevent: progress\ndata: {text}\n\n"
-        if job.state not in UNFINISHED_STATES:
-            return
-        while True:
-            try:
-                state = await gateway.job_notifier.wait_for_change(
-                    job_id, last_seen, HEARTBEAT_SECONDS
-                )
-                row = await run_in_threadpool(find_job, gateway, job_id)
-                break
-            except TimeoutError:
-                yield ": heartbeat\n\n"
-            except SQLAlchemyError as error:
-                if to_unavailable(error) is None:
-                    raise
-                yield ": the catalog is unreachable\n\n"
-                await asyncio.sleep(CATALOG_RETRY_SECONDS)
-        if state is None or row is None:
-            return
-        job, last_seen = JobResponse.of(row, map_name, job.filename), state

@@ -1,63 +1,20 @@
-// A job until it ends: server-sent events, or polling where a proxy keeps those back.
+// A job until it ends.
 
-import { ask, get, post } from "./api.js";
+import { get, post } from "./api.js";
 import { bar, button, fill, h, note, noteError } from "./dom.js";
 import { percent } from "./format.js";
 
 const ENDED = ["succeeded", "failed", "cancelled"];
-const SILENCE_MS = 40_000; // the server sends a heartbeat every 15 s
-const POLL_SECONDS = 10;
+const POLL_SECONDS = 1; // short, so that the progress moves; the end is answered at once
 
 export const hasEnded = (job) => ENDED.includes(job.state);
 
-/** Tells `onChange` of every change; resolves with the job as it ended. `query` may name its map. */
+/** Tells `onChange` of each state; resolves with the job as it ended. `query` may name its map. */
 export async function watchJob(id, onChange, signal, query = {}) {
-  try {
-    for await (const job of events(id, signal, query)) {
-      onChange(job);
-      if (hasEnded(job)) return job;
-    }
-  } catch (error) {
-    if (signal?.aborted) throw error;
-  }
   while (true) {
     const job = await get(`/jobs/${id}`, { query: { ...query, wait: POLL_SECONDS }, signal });
     onChange(job);
     if (hasEnded(job)) return job;
-  }
-}
-
-// Not EventSource: it can't send a key.
-async function* events(id, signal, query) {
-  const silence = new AbortController();
-  let timer;
-  const spoken = () => {
-    clearTimeout(timer);
-    timer = setTimeout(() => silence.abort(), SILENCE_MS);
-  };
-  const leave = () => silence.abort();
-  signal?.addEventListener("abort", leave);
-  try {
-    spoken();
-    const response = await ask(`/jobs/${id}/events`, { query, signal: silence.signal });
-    const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
-    let text = "";
-    while (true) {
-      const { done, value } = await reader.read();
-      if (done) return;
-      spoken();
-      text += value;
-      const whole = text.split("\n\n");
-      text = whole.pop();
-      for (const event of whole) {
-        const data = event.split("\n").filter((line) => line.startsWith("data:")).map((line) => line.slice(5)).join("\n");
-        if (data) yield JSON.parse(data);
-      }
-    }
-  } finally {
-    clearTimeout(timer);
-    signal?.removeEventListener("abort", leave);
-    silence.abort();
   }
 }
 

@@ -6,7 +6,7 @@ import { count, plural } from "./format.js";
 import { stateInWords, watchJob } from "./jobs.js";
 import { readZip } from "./zip.js";
 
-const AT_ONCE = 3; // browsers keep six connections to a server, and each job's events take one
+const AT_ONCE = 3; // browsers keep six connections to a server, and each job that is polled takes one
 const ONE_BY_ONE = 24; // more than these go as batches
 const BATCH_PHOTOS = 60;
 const BATCH_BYTES = 120_000_000;

@@ -318,20 +318,6 @@ def test_concurrent_uploads_of_a_key_and_of_an_address_are_limited(
         assert room.active_uploads(UploadKind.UPLOAD) == 1, "places are given back"
 
 
-def test_an_event_stream_too_many_is_refused_and_one_that_ended_makes_room(
-    make_service: Make, catalog: Catalog
-) -> None:
-    with catalog.write() as session:
-        ended = add_job(session, get_map(session, "city").id, state=JobState.FAILED).id
-    events = f"/jobs/{ended}/events?map=city"
-    service = make_service(max_connections=4)
-    for _ in range(2):
-        assert service("GET", events).text.startswith("id: 1\nevent: progress\n")
-    refused = make_service(max_connections=3)("GET", events)
-    problem(refused, 429, "too_many_event_streams")
-    assert int(refused.headers["retry-after"]) >= 1
-
-
 @pytest.mark.usefixtures("always_look")
 def test_health_reports_the_use_of_queues_and_disks(
     make_service: Make, catalog: Catalog, monkeypatch: pytest.MonkeyPatch

@@ -13,7 +13,7 @@ import pytest
 from sqlalchemy import event
 from sqlalchemy.exc import OperationalError
 
-from services.gateway.dependencies import NOTIFIER_POLL_SECONDS, JobNotifier, WatchedState
+from services.gateway.dependencies import NOTIFIER_POLL_SECONDS, JobNotifier
 from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
 from shared.ids import new_id
@@ -126,52 +126,12 @@ def test_waiting_requests_share_one_poll(catalog: Catalog, jobs: list[UUID]) -> 
         asyncio.run(scenario())
 
 
-def test_event_streams_share_one_poll_and_wake_at_their_jobs_change(
-    catalog: Catalog, jobs: list[UUID]
-) -> None:
-    polls: list[str] = []
-
-    async def scenario() -> None:
-        notifier = JobNotifier(catalog)
-        seen = await asyncio.gather(*(notifier.wait_for_change(job, (), LONG) for job in jobs))
-        states = dict(zip(jobs, seen, strict=True))
-        polls.clear()
-        waits = [
-            asyncio.create_task(
-                notifier.wait_for_change(jobs[n % 3], states[jobs[n % 3]] or (), LONG)
-            )
-            for n in range(500)
-        ]
-        await asyncio.sleep(1.0)
-        assert 1 <= len(polls) <= 6, "not one for each stream"
-        assert not any(wait.done() for wait in waits)
-        set_columns(catalog, jobs[1], progress_done=7)
-        for state in await asyncio.wait_for(asyncio.gather(*waits[1::3]), LONG):
-            assert state is not None
-            assert 7 in state
-        assert not any(wait.done() for wait in waits[0::3])
-        notifier.begin_shutdown()
-        ended = await asyncio.wait_for(asyncio.gather(*waits[0::3]), LONG)
-        assert set(ended) == {None}, "a server that stops ends its streams"
-        assert await notifier.wait_for_change(jobs[0], (), LONG) is None
-
-    with on_each_select(catalog, polls.append):
-        asyncio.run(scenario())
-
-
-def test_waiting_for_a_change_ends_with_an_outage_of_the_catalog_and_with_the_timeout(
-    catalog: Catalog, jobs: list[UUID]
-) -> None:
+def test_waiting_ends_with_an_outage_of_the_catalog(catalog: Catalog, jobs: list[UUID]) -> None:
     def fail(statement: str) -> None:
         raise OperationalError(statement, {}, Exception("unreachable"))
 
-    async def wait(seconds: float) -> WatchedState | None:
-        return await JobNotifier(catalog).wait_for_change(jobs[0], (), seconds)
-
-    with pytest.raises(TimeoutError):
-        asyncio.run(wait(0.001))
     with on_each_select(catalog, fail), pytest.raises(OperationalError):
-        asyncio.run(wait(LONG))
+        asyncio.run(JobNotifier(catalog).wait_until_finished(jobs[0], LONG))
 
 
 def test_a_client_that_disconnects_ends_no_other_wait(catalog: Catalog, jobs: list[UUID]) -> None:

@@ -113,9 +113,6 @@ def test_every_url_in_an_answer_leads_to_its_map(service: Service) -> None:
 
     call("list_jobs", "GET", "/jobs")
     call("get_job", "GET", f"/jobs/{job_id}")
-    events = service("GET", f"/jobs/{job_id}/events", params={"map": MAP}).text
-    event = json.loads(events.split("data: ")[1].split("\n")[0])
-    assert service("GET", event["status_url"].removeprefix(API)).json()["job_id"] == job_id
     call("get_photo", "GET", f"/uploads/{file_id}")
     call("patch_photo", "PATCH", f"/uploads/{file_id}", json={"tags": ["a"]})
     call("search_metadata", "GET", "/search")
