@@ -12,8 +12,6 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import partial
 from operator import methodcaller
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO
@@ -21,9 +19,8 @@ from typing import Annotated, Any, BinaryIO
 import rich.table
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
-from rich.measure import Measurement
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -34,6 +31,7 @@ from rich.progress import (
 )
 from rich.segment import Segment
 from rich.style import StyleType
+from rich.table import Column
 from rich.text import Text
 
 from shared.errors import InvalidRequest, Misconfigured, PlacewiseError
@@ -164,43 +162,20 @@ def print_result(result: Any, as_json: bool, message: str) -> None:
         print_message(message)
 
 
-MIN_NAME_WIDTH = 12  # characters
-
-
-@dataclass(frozen=True, slots=True)
-class _Name:
-    """A name, path or ID in a table: one line, shortened in the middle if the column is narrow."""
-
-    text: Text
-
-    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
-        return Measurement(MIN_NAME_WIDTH, self.text.cell_len)
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        excess = self.text.cell_len - options.max_width
-        if excess <= 0:
-            yield self.text
-            return
-        shown = max(0, options.max_width - 1)
-        end = shown // 2
-        name = self.text.plain
-        yield Text(f"{name[: shown - end]}…{name[len(name) - end :]}", style=self.text.style)
-
-
 class Table(rich.table.Table):
-    """A table for `print_table`. In a narrow terminal, text wraps and long names are shortened.
+    """A table for `print_table`. In a narrow terminal, long texts and names continue below.
 
-    A cell of one word is a name. A column without a header is left out of tab-separated output.
+    A column without a header is left out of tab-separated output.
     """
 
     def __init__(
         self,
-        *headers: rich.table.Column | str,
+        *headers: Column | str,
         title: str | None = None,
         caption: str | None = None,
     ) -> None:
         super().__init__(
-            *headers,
+            *(Column(each, overflow="fold") if isinstance(each, str) else each for each in headers),
             title=title,
             caption=caption,
             box=SIMPLE_HEAD,
@@ -215,14 +190,17 @@ class Table(rich.table.Table):
         end_section: bool = False,
     ) -> None:
         """Add a row; strings may contain markup."""
-        cells = (_shorten_name(each) for each in renderables)
+        # Before their width is measured.
+        cells = (
+            each.translate(_REPLACED_IN_LINES) if isinstance(each, str) else each
+            for each in renderables
+        )
         super().add_row(*cells, style=style, end_section=end_section)
 
 
 def print_table(table: Table) -> None:
-    """Print a table; unless stdout is a terminal, as tab-separated values without shortening."""
+    """Print a table; unless stdout is a terminal, as tab-separated values."""
     if console.is_terminal:
-        _fit_columns(table, console.width)
         console.print(table)
         return
     if table.title:
@@ -234,31 +212,7 @@ def print_table(table: Table) -> None:
         typer.echo(_plain_text(table.caption))
 
 
-def _fit_columns(table: Table, width: int) -> None:
-    """Narrow the widest columns until the table fits; rich would narrow names to a character."""
-    measure = partial(Measurement.get, console, console.options)
-    columns = table.columns
-    widths = [max(measure(cell).maximum for cell in (c.header, *c.cells)) for c in columns]
-    padding_and_dividers = 2 * len(columns) - 1
-    while sum(widths) + padding_and_dividers > width and max(widths) > MIN_NAME_WIDTH:
-        widths[widths.index(max(widths))] -= 1
-    for column, fitted in zip(columns, widths, strict=True):
-        column.width = fitted
-        column.overflow = "fold"
-
-
-def _shorten_name(cell: RenderableType | None) -> RenderableType | None:
-    if isinstance(cell, str):
-        cell = cell.translate(_REPLACED_IN_LINES)  # before its width is measured
-        text = Text.from_markup(cell)
-        if text.cell_len > MIN_NAME_WIDTH and not any(map(str.isspace, text.plain)):
-            return _Name(text)
-    return cell
-
-
 def _plain_text(cell: RenderableType) -> str:
-    if isinstance(cell, _Name):
-        return printable_text(cell.text.plain)
     text = Text.from_markup(cell) if isinstance(cell, str) else cell
     return printable_text(" ".join(text.plain.split())) if isinstance(text, Text) else ""
 

@@ -144,7 +144,7 @@ def query(
         Column("score", no_wrap=True),
         *([Column("match", justify="right", no_wrap=True)] if levels else []),
         *([Column("points", justify="right", no_wrap=True)] if answer.matches else []),
-        Column("photo", overflow="fold"),
+        "photo",
         Column("latitude", no_wrap=True),
         Column("longitude", no_wrap=True),
         "place",
@@ -180,7 +180,7 @@ def query(
 def _pose_table(pose: CameraPose) -> Table:
     """Name and value of what is known about a pose."""
     camera = pose.camera
-    table = Table("pose", Column("value", overflow="fold"), caption=pose.reason)
+    table = Table("pose", "value", caption=pose.reason)
     for name, value, unit, digits in (
         ("latitude", pose.latitude, "", 7),
         ("longitude", pose.longitude, "", 7),
@@ -221,7 +221,7 @@ def _levels_table(estimate: Estimate) -> Table:
     rings = ", ".join(f"{share} % within {_format_m(m)}" for share, m in radii if m is not None)
     source = str(estimate.calibration_source)
     table = Table(
-        Column("level", overflow="fold"),
+        "level",
         Column("probability", justify="right", no_wrap=True),
         Column("", width=BAR_WIDTH),
         caption=f"{f'Position: {rings}. ' if rings else ''}Probabilities were fitted "

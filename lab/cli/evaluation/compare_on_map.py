@@ -330,7 +330,7 @@ def _print_comparison(compared: Sequence[dict[str, Any]], photos: int) -> None:
     best = compared[0]
     names = ("R@1", "95 %", "answered", "right", "CPU ms", "bytes")
     table = Table(
-        Column("extractor", overflow="fold"),
+        "extractor",
         *(Column(name, justify="right", no_wrap=True) for name in names),
         caption=f"{best['queries']}, among {photos} photos. Answered and right: at a certainty of "
         f"{DECISIVE_CERTAINTY:g}. CPU: describing a photo, without decoding.",
@@ -338,7 +338,7 @@ def _print_comparison(compared: Sequence[dict[str, Any]], photos: int) -> None:
     for each in compared:
         interval = each["recall_at_1"]["interval"]
         table.add_row(
-            Text(each["extractor"]),  # not shortened: names differ at their ends
+            Text(each["extractor"]),
             format_percent(each["recall_at_1"]["mean"]),
             "-" if interval is None else f"{100 * interval[0]:.1f}-{100 * interval[1]:.1f}",
             format_percent(each["answered"]["mean"]),

@@ -151,7 +151,7 @@ def list_(as_json: JsonOption = False) -> None:
         print_json([asdict(weights) for weights in all_weights])
         return
     name = Column("extractor", overflow="fold", min_width=23)
-    table = Table(name, "available", "size", Column("source", overflow="fold"), "licence")
+    table = Table(name, "available", "size", "source", "licence")
     for weights in all_weights:
         table.add_row(
             escape(weights.extractor),
