@@ -192,17 +192,15 @@ class AsyncClient(AsyncTransport):
         return [answers.Proposal(**each) for each in answer["proposals"]]
 
     async def begin_track(
-        self, /, *, motion: str | None = None, max_speed_mps: float | None = None, **start: Any
+        self, *, motion: str | None = None, max_speed_mps: float | None = None
     ) -> answers.Track:
         """Begin a track: a sequence of frames that is followed through the map.
 
         Args:
             motion: How the camera moves: `walk`, `bicycle`, `car` (the default) or `train`.
             max_speed_mps: Its maximum speed in m/s, instead of `motion`.
-            start: Where the track begins, if known: `latitude`, `longitude` (degrees) and
-                `accuracy_m`; or `place`.
         """
-        body = drop_none(motion=motion, max_speed_mps=max_speed_mps, **start)
+        body = drop_none(motion=motion, max_speed_mps=max_speed_mps)
         return answers.Track(**await self._call("POST", "/tracks", json=body))
 
     async def add_frame(

@@ -197,7 +197,7 @@ class TrackFilter:
             belief, self._graph.photos(belief.photos), self._scheme, self._motion.typical_speed_mps
         )
 
-    def smooth(self, frames: Sequence[FrameEvidence], start: Belief | None = None) -> list[Belief]:
+    def smooth(self, frames: Sequence[FrameEvidence]) -> list[Belief]:
         """Return the belief at each frame given all frames, earlier and later.
 
         This is the forward-backward algorithm (Rabiner 1989) on the sparse beliefs of the forward
@@ -206,28 +206,25 @@ class TrackFilter:
 
         Args:
             frames: In the order of time.
-            start: The belief before the first frame; None if nothing is known.
         """
         count = max(self._graph.photo_count, 1)
         steps: list[_Step] = []
         smoothed: list[Belief] = []
         for frame in frames:
-            before = steps[-1].belief if steps else start or _start(frame)
+            before = steps[-1].belief if steps else _start(frame)
             steps.append(self._step(before, frame))
             if len(steps) == SMOOTHED_AT_ONCE + LATER_FRAMES:
                 smoothed += _backward(steps, count)[:SMOOTHED_AT_ONCE]
                 del steps[:SMOOTHED_AT_ONCE]
         return smoothed + _backward(steps, count)
 
-    def smoothed_states(
-        self, frames: Sequence[FrameEvidence], start: Belief | None = None
-    ) -> list[TrackState]:
-        """Return where the camera is at each frame given all frames; arguments as of `smooth`.
+    def smoothed_states(self, frames: Sequence[FrameEvidence]) -> list[TrackState]:
+        """Return where the camera is at each frame given all frames, in the order of time.
 
         The status follows from the smoothed probabilities, as that of `advance` does from those
         that were known at the frame.
         """
-        beliefs = self.smooth(frames, start)
+        beliefs = self.smooth(frames)
         for number in range(len(beliefs) - 2, -1, -1):
             later = beliefs[number + 1].direction * (1 - 1 / DIRECTION_FRAMES)
             if later > beliefs[number].direction:
@@ -235,7 +232,7 @@ class TrackFilter:
         states: list[TrackState] = []
         for belief in beliefs:
             state = self.state(belief)
-            before = states[-1].status if states else start.status if start else "converging"
+            before = states[-1].status if states else "converging"
             status = next_status(before, state.probability, state.outside)
             states.append(replace(state, status=status))
         return states

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 from uuid import UUID
 
-import numpy as np
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
@@ -42,8 +41,6 @@ from shared.catalog.tracks import (
 )
 from shared.errors import Conflict, Gone, PlacewiseError
 from shared.evaluation.places.levels import LevelScheme
-from shared.evaluation.places.probability import OUT_OF_MAP_SHARE
-from shared.geodesy import distances_m
 from shared.jobs import Job, JobState
 from shared.jobs.transitions import requeue_job_as_new
 from shared.responses.tracks import TrackStateResponse
@@ -57,11 +54,7 @@ from shared.tracks.evidence import (
     PositionFix,
     frame_evidence,
 )
-from shared.tracks.filter import MAX_PHOTOS, TrackFilter
-from shared.tracks.nearest import find_nearest
-
-START_ACCURACY_M = 50.0
-START_PROBABILITY = 0.9  # of the photos at a stated start, together
+from shared.tracks.filter import TrackFilter
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,12 +200,8 @@ def _advance(
                 TrackFrame.captured_at > frame.captured_at, TrackFrame.evidence.is_not(None)
             )
         ).all()
-        track_filter, graph = _open_filter(gateway, session, pending.track)
-        belief = (
-            _start_belief(graph, pending.track, evidence)
-            if before is None
-            else Belief.from_bytes(before)
-        )
+        track_filter = _open_filter(gateway, session, pending.track)
+        belief = None if before is None else Belief.from_bytes(before)
         changed: dict[UUID, dict[str, Any]] = {}
         for frame_id, each in [(frame.id, evidence), *((f.id, _evidence_of(f)) for f in later)]:
             belief = track_filter.advance(belief, each)
@@ -262,9 +251,8 @@ def smooth_states(
     if not applied:
         return {}
     with gateway.catalog.read() as session:
-        track_filter, graph = _open_filter(gateway, session, track)
         evidence = [_evidence_of(frame) for frame in applied]
-        states = track_filter.smoothed_states(evidence, _start_belief(graph, track, evidence[0]))
+        states = _open_filter(gateway, session, track).smoothed_states(evidence)
         return {
             frame.id: track_state_response(state, each.fix)
             for frame, state, each in zip(applied, states, evidence, strict=True)
@@ -275,53 +263,10 @@ def _evidence_of(frame: TrackFrame) -> FrameEvidence:
     return FrameEvidence.model_validate(frame.evidence)
 
 
-def _open_filter(
-    gateway: GatewayContext, session: Session, track: Track
-) -> tuple[TrackFilter, CatalogPhotoGraph]:
+def _open_filter(gateway: GatewayContext, session: Session, track: Track) -> TrackFilter:
     map_ = session.get_one(Map, track.map_id)
     scheme = LevelScheme(
         labels_are_paths=map_.place_labels_are_paths, radii_m=gateway.settings.level_radii_m
     )
-    graph = CatalogPhotoGraph(session, track.map_id)
     motion = TrackParams.model_validate(track.params).motion_model()
-    return TrackFilter(graph, motion, scheme), graph
-
-
-def _start_belief(graph: CatalogPhotoGraph, track: Track, first: FrameEvidence) -> Belief | None:
-    """Return the belief before the first frame; None if no photo is at the stated start, if any.
-
-    If more than MAX_PHOTOS photos are there, the hits of the first frame among them and the
-    nearest have a probability of their own; that of the others is elsewhere.
-    """
-    params = TrackParams.model_validate(track.params)
-    hits = graph.photos([hit.photo for hit in first.hits])
-    if params.place is not None:
-        near, count = graph.labelled(params.place, MAX_PHOTOS)
-        start = hits.take(hits.places == params.place).union(near)
-    elif params.latitude is not None and params.longitude is not None:
-        latitude, longitude = params.latitude, params.longitude
-        accuracy_m = params.accuracy_m or START_ACCURACY_M
-        near, complete_m = find_nearest(
-            lambda radius_m, limit: graph.near(latitude, longitude, radius_m, limit),
-            accuracy_m,
-            MAX_PHOTOS,
-        )
-        away = distances_m(latitude, longitude, hits.latitudes, hits.longitudes)
-        start = hits.take(away <= accuracy_m).union(near)
-        # The others lie as densely as the nearest ones.
-        count = round(len(near) * (accuracy_m / complete_m) ** 2)
-    else:
-        return None
-    if not len(start):
-        return None
-    start = start.take(np.arange(min(len(start), MAX_PHOTOS)))
-    count = max(len(start), min(count, graph.photo_count))
-    there = START_PROBABILITY * len(start) / count
-    return Belief(
-        time=first.time,
-        photos=tuple(start.ids.tolist()),
-        probabilities=np.full(len(start), START_PROBABILITY / count),
-        elsewhere=START_PROBABILITY - there + (1 - START_PROBABILITY) * (1 - OUT_OF_MAP_SHARE),
-        outside=(1 - START_PROBABILITY) * OUT_OF_MAP_SHARE,
-        seen={},
-    )
+    return TrackFilter(CatalogPhotoGraph(session, track.map_id), motion, scheme)

@@ -31,7 +31,7 @@ from sqlalchemy import (
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import Session
 
-from shared.catalog.database.base import Condition, count_rows
+from shared.catalog.database.base import Condition
 from shared.catalog.maps import CachedMapStatistics
 from shared.catalog.photos import Photo, PhotoRole, count_live_photos
 from shared.geodesy import EARTH_RADIUS_M, distances_m, latitude_bounds, longitude_half_width
@@ -100,12 +100,6 @@ class CatalogPhotoGraph:
         found, is_all = self._inside(boxes, limit)
         away = distances_m(latitude, longitude, found.latitudes, found.longitudes)
         return found.take(away <= radius_m), is_all
-
-    def labelled(self, place: str, limit: int) -> tuple[PhotoTable, int]:
-        """Return up to `limit` photos with exactly this place label, and the number of all."""
-        of_label = (Photo.map_id == self._map_id, Photo.place == place)
-        found = self._select(*of_label, limit=limit)
-        return found, count_rows(self._session, _live_photos(Photo.id).where(*of_label))
 
     def count_labels(self, places: Collection[str]) -> Mapping[str, int]:
         """Return the number of photos without coordinates that have each of these labels.

@@ -8,10 +8,9 @@ from uuid import UUID
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from services.gateway.dependencies import NO_NUL_PATTERN
 from shared.geodesy import distance_m
 from shared.http.request_model import RequestModel
-from shared.ingest.photo_metadata import MAX_TEXT_CHARACTERS, parse_time
+from shared.ingest.photo_metadata import parse_time
 from shared.responses.similarity import EstimateLevelResponse
 from shared.responses.tracks import TrackStateResponse
 from shared.tracks.evidence import Odometry, PositionFix
@@ -35,27 +34,11 @@ class TrackParams(RequestModel):
     max_speed_mps: float | None = Field(
         None, gt=0, le=1000, description="maximum speed in m/s, instead of `motion`"
     )
-    latitude: Latitude = Field(None, description="where the track begins, if it is known")
-    longitude: Longitude = None
-    accuracy_m: AccuracyM = Field(None, description="radius around that position; 50 if omitted")
-    place: str | None = Field(
-        None,
-        min_length=1,
-        max_length=MAX_TEXT_CHARACTERS,
-        pattern=NO_NUL_PATTERN,
-        description="place label where the track begins, instead of a position",
-    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.motion is not None and self.max_speed_mps is not None:
             raise ValueError("send `motion` or `max_speed_mps`, not both")
-        if (self.latitude is None) != (self.longitude is None):
-            raise ValueError("send both `latitude` and `longitude`, or neither")
-        if self.latitude is None and self.accuracy_m is not None:
-            raise ValueError("`accuracy_m` needs `latitude` and `longitude`")
-        if self.latitude is not None and self.place is not None:
-            raise ValueError("send a position or a `place`, not both")
         return self
 
     def motion_model(self) -> MotionModel:

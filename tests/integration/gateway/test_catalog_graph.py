@@ -9,16 +9,15 @@ from uuid import UUID
 
 import numpy as np
 import pytest
-from sqlalchemy import delete, insert
+from sqlalchemy import delete, insert, select
 
 from lab.evaluation.array_photo_graph import ArrayPhotoGraph
-from services.gateway.tracks import apply_frames, catalog_graph
+from services.gateway.tracks import catalog_graph
 from services.gateway.tracks.catalog_graph import CatalogPhotoGraph
 from services.steward.tasks.maintenance import update_statistics_of_large_maps
 from shared.catalog.database.base import db_now
 from shared.catalog.database.session import Catalog
 from shared.catalog.photos import Photo, PhotoRole
-from shared.catalog.tracks import Track
 from shared.jobs import Job, JobKind
 from shared.tracks import filter as filter_module
 from shared.tracks.belief import Belief
@@ -69,9 +68,9 @@ def test_the_graph_of_the_catalog_equals_that_of_arrays(catalog: Catalog, map_id
         assert graph.photo_count == 180
         everywhere = [graph.near(*center, 1000.0, 40)[0] for center in CENTERS]
         assert [len(table) for table in everywhere] == [40, 40, 40]
-        by_time, count = graph.labelled("room 0", 10)
-        assert len(by_time) == count == 2
-        assert graph.labelled("room 0", 1)[1] == 2
+        labelled = session.scalars(select(Photo.id).where(Photo.place == "room 0"))
+        by_time = graph.photos([str(photo_id) for photo_id in labelled])
+        assert len(by_time) == 2
         all_times, is_all = graph.around(by_time, 1.0, 100.0, 60)
         assert (len(all_times), is_all) == (60, True)
         assert graph.around(by_time, 1.0, 100.0, 59)[1] is False
@@ -102,30 +101,19 @@ def test_the_graph_of_the_catalog_equals_that_of_arrays(catalog: Catalog, map_id
         assert len(graph.photos([])) == 0
 
 
-SPOT = {"latitude": 45.0, "longitude": 7.0}
-ANYWHERE = {**SPOT, "accuracy_m": 100_000.0}
-
-
 @pytest.mark.parametrize(
-    ("is_located", "start", "fix"),
-    [
-        (True, ANYWHERE, None),
-        (True, {"place": "town"}, None),
-        (True, {}, PositionFix(**ANYWHERE)),
-        (False, {"place": "town"}, None),
-    ],
-    ids=["a start of 100 km", "a start at a label", "a fix of 100 km", "a label without positions"],
+    ("is_located", "fix"),
+    [(True, PositionFix(latitude=45.0, longitude=7.0, accuracy_m=100_000.0)), (False, None)],
+    ids=["a fix of 100 km", "a label without positions"],
 )
-def test_the_size_of_a_step_does_not_depend_on_the_number_of_photos_at_a_start_or_fix(
+def test_the_size_of_a_step_does_not_depend_on_the_number_of_photos_at_a_fix_or_label(
     catalog: Catalog,
     monkeypatch: pytest.MonkeyPatch,
     is_located: bool,
-    start: dict[str, Any],
     fix: PositionFix | None,
 ) -> None:
     most_near, most_photos, most_of_label = 60, 20, 30
-    for module in (filter_module, apply_frames):
-        monkeypatch.setattr(module, "MAX_PHOTOS", most_photos)
+    monkeypatch.setattr(filter_module, "MAX_PHOTOS", most_photos)
     for module in (filter_module, catalog_graph):
         monkeypatch.setattr(module, "MAX_SAME_LABEL", most_of_label)
     monkeypatch.setattr(filter_module, "MAX_NEAR", most_near)
@@ -164,13 +152,8 @@ def test_the_size_of_a_step_does_not_depend_on_the_number_of_photos_at_a_start_o
     monkeypatch.setattr(CatalogPhotoGraph, "_table", read)
     with catalog.read() as session:
         track_filter = TrackFilter(CatalogPhotoGraph(session, map_id))
-        belief = apply_frames._start_belief(
-            CatalogPhotoGraph(session, map_id), Track(params=start), frames[0]
-        )
-        smoothed = track_filter.smooth(frames, belief)
-    beliefs = [*smoothed, *([] if belief is None else [belief])]
-    assert (belief is None) == (not start)
-    for each in beliefs:
+        smoothed = track_filter.smooth(frames)
+    for each in smoothed:
         assert len(Belief.from_bytes(each.to_bytes()).photos) <= most_photos + len(hits)
     assert most_near < max(sizes) <= most_photos + len(hits) + 2 * most_near
 
