@@ -35,7 +35,8 @@ from shared.descriptors.side_by_side import SideBySideExtractor
 from shared.descriptors.vocabulary import ClusterCentres, decode_centres
 from shared.errors import PlacewiseError, Unavailable
 from shared.extractor_config.configs import ExtractorConfig
-from shared.matching.detectors import Detector, load_detector
+from shared.matching.features import DETECTOR
+from shared.matching.xfeat import XFeatDetector, load_detector
 from shared.storage import ObjectStore
 
 LoadAddedModel = Callable[[ExtractorConfig, torch.device], Backbone]
@@ -174,14 +175,14 @@ class ModelRegistry:
         self._on_load(time.perf_counter() - started)
         return extractor
 
-    def detector(self, name: str) -> Detector:
-        """Return the detector of local features called `name` with its weights loaded.
+    def detector(self) -> XFeatDetector:
+        """Return the detector of local features with its weights loaded.
 
         Raises:
             Misconfigured: as `load_detector`.
         """
-        with self._lock, self._report_load(name):
-            return load_detector(name, self._device)
+        with self._lock, self._report_load(DETECTOR):
+            return load_detector(self._device)
 
     def centres(self, vocabulary: Vocabulary) -> ClusterCentres:
         """Return the vocabulary's centres, verified against the catalog's hash."""

@@ -98,11 +98,6 @@ class ExtractorSettings(BaseSettings):
         description="number of decoding processes, unless set a quarter of the processors, at "
         "least 2; with a GPU, all but two of them; with S3, which they wait for, twice as many",
     )
-    local_features: Literal["xfeat", "aliked-n16"] = Field(
-        "xfeat",
-        description="local features of new generations, by which photos are matched: xfeat (at "
-        "most 70 kB a photo) or aliked-n16 (132 kB; slower, better; needs the extra `lightglue`)",
-    )
 
     @field_validator("code_allowed")
     @classmethod
