@@ -52,8 +52,6 @@ SLOW_TEST_BACKBONE = "test-slow"  # the backbone whose width and time are option
 MAX_WIDTH = 131_072
 MAX_MILLISECONDS = 60_000
 MAX_TEMPERATURE = 1000
-THUMBNAIL_PATCH = 4  # pixels; the side of a patch that `patchnorm` normalises
-MAX_THUMBNAIL_SIDE = 256  # pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +97,6 @@ class ExtractorConfig:
     input: NetworkInput | None = None
     """What an exported network expects; None for other extractors."""
     for_tests: bool = False
-    size: str | None = None
-    """`WIDTHxHEIGHT` of a thumbnail; None for other extractors."""
     milliseconds: int = 0
     """Simulated time per photo (a sleep), of an extractor for tests."""
 
@@ -196,7 +192,6 @@ EXTRACTOR_CONFIGS = {
             parameters=0,
             preprocessing="resize32x64",
             aggregator="none",
-            size="64x32",
         ),
         ExtractorConfig(
             name="test-tiny-avg",
@@ -375,9 +370,6 @@ def _apply_options(base: ExtractorConfig, options: str) -> ExtractorConfig:
                 f"The option {option}={values[option]} of {base.name} can't be used: "
                 f"{option} is {expected}."
             ) from None
-    if config.size is not None:
-        width, height = map(int, config.size.split("x"))
-        config = replace(config, width=width * height, preprocessing=f"resize{height}x{width}")
     changed = {
         option: f"{option}={_format_value(getattr(config, option))}"
         for option in sorted(values)
@@ -426,11 +418,6 @@ def _allowed_options(base: ExtractorConfig, config: ExtractorConfig) -> dict[str
             _integer_between(0, last),
             f"a whole number from 0 to {last} ({base.backbone} has {base.depth} blocks)",
         )
-    if base.size is not None:
-        allowed["size"] = (
-            _parse_thumbnail_size,
-            f"WIDTHxHEIGHT, multiples of {THUMBNAIL_PATCH} up to {MAX_THUMBNAIL_SIDE} pixels",
-        )
     if base.backbone == SLOW_TEST_BACKBONE:
         allowed["milliseconds"] = (
             _integer_between(0, MAX_MILLISECONDS),
@@ -460,14 +447,6 @@ def _one_of(names: tuple[str, ...]) -> OptionParser:
         return value
 
     return parse, f"one of {', '.join(names)}"
-
-
-def _parse_thumbnail_size(value: str) -> str:
-    if not re.fullmatch(r"[1-9][0-9]{0,2}x[1-9][0-9]{0,2}", value):
-        raise ValueError(value)
-    if any(int(s) % THUMBNAIL_PATCH or int(s) > MAX_THUMBNAIL_SIDE for s in value.split("x")):
-        raise ValueError(value)
-    return value
 
 
 def _parse_temperature(value: str) -> float:
