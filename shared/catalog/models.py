@@ -48,7 +48,6 @@ class Model(Journaled, Base):
     fingerprint: Mapped[str] = mapped_column(sa.String(64))
     licence: Mapped[str] = mapped_column(sa.Text)
     card: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
-    first_used_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     added_name: Mapped[str | None] = mapped_column(sa.String(100))
     added_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     object_key: Mapped[str | None] = mapped_column(sa.Text)

@@ -147,4 +147,4 @@ def test_an_extractor_name_that_can_not_be_read_hides_no_model(door: Door) -> No
     }
     assert door(ADMIN, "DELETE", "/models/tiny").status_code == 409
     refused = door(ADMIN, "POST", "/maps", json={"name": "a", "extractor": name})
-    assert "two extractors" in problem(refused, 422, "invalid_field")["detail"]
+    assert "a model name has" in problem(refused, 422, "invalid_field")["detail"]
