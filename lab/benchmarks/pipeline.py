@@ -100,7 +100,7 @@ def run_free_extractor() -> None:
     descriptors = torch.nn.functional.normalize(torch.randn(MAX_KEYPOINTS, DIMENSION))
     found = torch.rand(MAX_KEYPOINTS, 2) * WORKING_SIDE, descriptors
 
-    def find_keypoints(_: XFeatDetector, pixels: Pixels) -> Any:
+    def find_keypoints(_: XFeatDetector, pixels: Pixels) -> list[tuple[torch.Tensor, torch.Tensor]]:
         return [found] * len(pixels)
 
     XFeatDetector.find_keypoints = find_keypoints  # type: ignore[method-assign]
