@@ -103,7 +103,7 @@ def run_free_extractor() -> None:
     def find_keypoints(_: XFeatDetector, pixels: Pixels) -> list[tuple[torch.Tensor, torch.Tensor]]:
         return [found] * len(pixels)
 
-    XFeatDetector.find_keypoints = find_keypoints  # type: ignore[method-assign]
+    XFeatDetector.find_keypoints = find_keypoints  # type: ignore[assignment]
     Extractor.describe = describe  # type: ignore[assignment]
     sys.argv[1:] = ["extractor"]
     main()
