@@ -1,6 +1,6 @@
 """Matches of local features: their cost, and what they add to place estimates.
 
-    placewise bench matches [FOLDER...] [--detector xfeat]
+    placewise bench matches [FOLDER...]
 
 Each folder is an evaluation set with coordinates or place labels; without one, it is the folder
 `tower` of PLACEWISE_TEST_DATA. Its descriptors and place models are those of `bench estimates`. The
@@ -15,11 +15,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
-import typer
 
 from lab.benchmarks.estimates import (
     DescribedPhotos,
@@ -34,23 +33,22 @@ from services.cli.output import JsonOption
 from shared.evaluation.places.evidence import match_support
 from shared.imaging.decode import decode_photo
 from shared.imaging.preprocessing import get_preprocessing
-from shared.matching.detectors import Detector, load_detector
 from shared.matching.features import LocalFeatures
-from shared.matching.matchers import MutualNearest
+from shared.matching.mutual_nearest import match_keypoints
 from shared.matching.verification import verify_matches
+from shared.matching.xfeat import XFeatDetector, load_detector
 
 MAX_FEATURES_MS = 70.0
 MAX_PAIR_MS = 12.0
-MAX_XFEAT_BYTES = 80_000
+MAX_FEATURE_BYTES = 80_000
 SQUARE = get_preprocessing("square32")
 
 
 class MatchedPhotos:
     """Local features of the photos of a set, and the match support of pairs, each computed once."""
 
-    def __init__(self, features: Callable[[int], LocalFeatures], matcher: MutualNearest) -> None:
+    def __init__(self, features: Callable[[int], LocalFeatures]) -> None:
         self.features = features
-        self.matcher = matcher
         self.match_seconds = self.verify_seconds = 0.0
         """CPU time of all pairs"""
         self.supports: dict[tuple[int, int], float] = {}
@@ -64,7 +62,7 @@ class MatchedPhotos:
         if pair not in self.supports:
             a, b = self.features(first), self.features(second)
             started = time.process_time()
-            matches = self.matcher.match(a, b)
+            matches = match_keypoints(a, b)
             matched = time.process_time()
             points = a.working_pixels()[matches[:, 0]], b.working_pixels()[matches[:, 1]]
             inliers = int(verify_matches(*points).sum())
@@ -76,30 +74,28 @@ class MatchedPhotos:
 
 def bench(
     folders: Folders = None,
-    detector: Annotated[str, typer.Option(help="xfeat or aliked-n16.")] = "xfeat",
     as_json: JsonOption = False,
 ) -> None:
     """Measure the cost of local features, and what their matches add to place estimates."""
     measured = evaluation_folders(folders)
-    loaded = load_detector(detector, torch.device("cpu"))
-    matcher = MutualNearest.of_model(loaded.model)
-    with printed_report(f"matches of {loaded.model}", as_json) as (report, progress):
+    detector = load_detector(torch.device("cpu"))
+    with printed_report(f"matches of {detector.model}", as_json) as (report, progress):
         for photos in describe_sets(measured, progress):
             bar = progress.add_task(f"{photos.name}: local features", total=len(photos.paths))
-            features, seconds = detect_all(loaded, photos.paths, partial(progress.advance, bar))
-            matched = MatchedPhotos(features.__getitem__, matcher)
+            features, seconds = detect_all(detector, photos.paths, partial(progress.advance, bar))
+            matched = MatchedPhotos(features.__getitem__)
             compare(report, photos, matched)
             add_cost(report, photos.name, features, matched, seconds)
 
 
 def detect_all(
-    detector: Detector, paths: Sequence[Path], on_photo: Callable[[], object]
+    detector: XFeatDetector, paths: Sequence[Path], on_photo: Callable[[], object]
 ) -> tuple[list[LocalFeatures], float]:
     """Return the local features of photos, and the CPU seconds of their detection."""
     torch.set_num_threads(1)
     features, seconds = list[LocalFeatures](), 0.0
     for path in paths:
-        photo = decode_photo(path.read_bytes(), SQUARE, 10**9, detection_channels=detector.channels)
+        photo = decode_photo(path.read_bytes(), SQUARE, 10**9, for_detection=True)
         assert photo.detection_pixels is not None
         started = time.process_time()
         features += detector.detect([photo.detection_pixels], [photo.size])
@@ -132,6 +128,6 @@ def add_cost(
     pair_ms = 1000 * (matched.match_seconds + matched.verify_seconds) / pairs
     match_ms = 1000 * matched.match_seconds / pairs
     report.add(f"{name}: CPU a photo", 1000 * seconds / photos, "ms", at_most=MAX_FEATURES_MS)
-    report.add(f"{name}: bytes a photo", float(size), "B", at_most=MAX_XFEAT_BYTES)
+    report.add(f"{name}: bytes a photo", float(size), "B", at_most=MAX_FEATURE_BYTES)
     report.add(f"{name}: CPU a pair", pair_ms, "ms", at_most=MAX_PAIR_MS)
     report.add(f"{name}: CPU a pair, matching alone", match_ms, "ms")

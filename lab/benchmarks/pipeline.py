@@ -40,8 +40,8 @@ from shared.catalog.maps import Map, Matching
 from shared.descriptors.backbones import normalise_features
 from shared.descriptors.extractor import Extractor
 from shared.imaging.preprocessing import Pixels
-from shared.matching.detectors import DETECTORS, Detector, Keypoints
 from shared.matching.features import MAX_KEYPOINTS, WORKING_SIDE
+from shared.matching.xfeat import DIMENSION, XFeatDetector
 from shared.search_api.client import HttpSearchClient
 from tests.support.fleet import Fleet, ServiceProcess, open_fleet, start_servers
 from tests.support.servers.daemon import free_ports
@@ -89,29 +89,21 @@ def bench(
             progress.advance(bar)
 
 
-class FreeDetector(Detector):
-    """Detector that finds the same keypoints in each photo without looking."""
-
-    dimension, channels = 64, 1
-
-    def __init__(self, device: torch.device) -> None:
-        super().__init__("xfeat", "0" * 12, device)
-        descriptors = torch.nn.functional.normalize(torch.randn(MAX_KEYPOINTS, self.dimension))
-        self._found = torch.rand(MAX_KEYPOINTS, 2) * WORKING_SIDE, descriptors
-
-    def find_keypoints(self, pixels: Pixels) -> Keypoints:
-        return [self._found] * len(pixels)
-
-
 def run_free_extractor() -> None:
-    """Run an extractor whose network and detector cost nothing."""
+    """Run an extractor whose network costs nothing, and whose detector finds the same in all."""
     made = functools.cache(lambda width: normalise_features(torch.randn(TEXTURES, width)).numpy())
 
     def describe(extractor: Extractor, photos: Sequence[Any], *_: Any) -> Any:
         rows = made(extractor.backbone.width)
         return rows[np.arange(len(photos)) % TEXTURES]
 
-    DETECTORS["xfeat"] = f"{__name__}:FreeDetector"
+    descriptors = torch.nn.functional.normalize(torch.randn(MAX_KEYPOINTS, DIMENSION))
+    found = torch.rand(MAX_KEYPOINTS, 2) * WORKING_SIDE, descriptors
+
+    def find_keypoints(_: XFeatDetector, pixels: Pixels) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        return [found] * len(pixels)
+
+    XFeatDetector.find_keypoints = find_keypoints  # type: ignore[assignment]
     Extractor.describe = describe  # type: ignore[assignment]
     sys.argv[1:] = ["extractor"]
     main()

@@ -51,9 +51,8 @@ from shared.evaluation.places.probability import (
     shipped_prior,
 )
 from shared.geodesy import EARTH_RADIUS_M
-from shared.matching.detectors import load_detector
 from shared.matching.features import LocalFeatures
-from shared.matching.matchers import MutualNearest
+from shared.matching.xfeat import load_detector
 
 OWN, QUERIES = "own photos", "queries"
 MATCHED_PHOTOS = 45  # of each set, and twice as many of a map's own
@@ -171,8 +170,7 @@ def _fit_log_odds(maps: Iterable[Mapping[str, FloatArray]]) -> Coefficients:
 
 def main(folders: Sequence[Path]) -> None:
     """Fit the levels and what photos of elsewhere score; each set that has places is a map."""
-    prior, detector = shipped_prior(), load_detector("xfeat", torch.device("cpu"))
-    matcher = MutualNearest.of_model(detector.model)
+    prior, detector = shipped_prior(), load_detector(torch.device("cpu"))
 
     @cache
     def features(path: Path) -> LocalFeatures:
@@ -183,9 +181,7 @@ def main(folders: Sequence[Path]) -> None:
     with Progress(console=console) as progress:
         for photos in chain(*(describe_sets(folders, progress, own) for own in (True, False))):
             background = TrialMap(photos, photos.is_database).background
-            matched = MatchedPhotos(
-                partial(lambda paths, n: features(paths[n]), photos.paths), matcher
-            )
+            matched = MatchedPhotos(partial(lambda paths, n: features(paths[n]), photos.paths))
             kinds = {"coefficients": None, "matched": matched.match}
             for kind, match in list(kinds.items())[: 2 if photos.extractor else 1]:
                 samples = map_samples(replace(photos, match=match))

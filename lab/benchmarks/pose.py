@@ -62,9 +62,8 @@ from shared.geometry.cameras import Camera, CameraSource, Floats
 from shared.geometry.frames import Alignment, EastNorthUp, align
 from shared.geometry.localise import LocalPose, localise
 from shared.geometry.radius import PoseCalibration, geo_pose
-from shared.matching.detectors import load_detector
 from shared.matching.features import LocalFeatures
-from shared.matching.matchers import MutualNearest
+from shared.matching.xfeat import load_detector
 
 WORDS = 32
 CANDIDATES = 10
@@ -113,13 +112,11 @@ class MappedPhotos:
     def __init__(
         self,
         features: Sequence[LocalFeatures],
-        model: str,
         seconds: Floats,
         positions: Floats | None = None,
     ) -> None:
         self.ids = [UUID(int=number + 1) for number in range(len(features))]
         self.features = dict(zip(self.ids, features, strict=True))
-        self.matcher = MutualNearest.of_model(model)
         self.vlad = Vlad(features)
         self.seconds = seconds
         latitudes, longitudes, _ = _coordinates(
@@ -127,7 +124,7 @@ class MappedPhotos:
         )
         started, started_cpu = time.perf_counter(), cpu_seconds()
         self.pairs = choose_pairs(self.vlad.rows, seconds, latitudes, longitudes)
-        matches = match_pairs(self.features, self.pairs, self.matcher, lambda _: None)
+        matches = match_pairs(self.features, self.pairs, lambda _: None)
         self.match_seconds = time.perf_counter() - started
         photos = [
             PhotoToMap(
@@ -158,9 +155,7 @@ class MappedPhotos:
         source = CameraSource.GIVEN if camera else CameraSource.ESTIMATED
         started = time.perf_counter()
         try:
-            return localise(
-                query, candidates, self.components, camera or None, source, self.matcher
-            )
+            return localise(query, candidates, self.components, camera or None, source)
         except Unprocessable:
             return None
         finally:
@@ -194,7 +189,7 @@ class MappedPhotos:
             [None] * len(rows),
             alignment.similarity if alignment else None,
         )
-        return localise_left_out(left_out, self.matcher, lambda _: None)
+        return localise_left_out(left_out, lambda _: None)
 
 
 def bench(
@@ -256,7 +251,7 @@ def measure_synthetic(report: Report) -> None:
 def measure_streets(report: Report, count: int, progress: Progress) -> list[tuple[str, int, int]]:
     """Report streets whose facades repeat, beside plain pycolmap with SIFT; return wrong poses."""
     columns = ("street", "photos", "m", "over 3 m", "poses", "m", "CPU s")
-    table, detector = Table(*columns, title="streets"), load_detector("xfeat", torch.device("cpu"))
+    table, detector = Table(*columns, title="streets"), load_detector(torch.device("cpu"))
     wrong = tried = 0
     for seed in STREETS[:count]:
         plan = plan_round_trip(seed, [(SPRING, 120)])
@@ -280,7 +275,7 @@ def measure_streets(report: Report, count: int, progress: Progress) -> list[tupl
             paths = [photo.path(folder) for photo in photos + queries]
             features, _ = detect_all(detector, paths, partial(progress.advance, bar))
             seconds = 2.0 * np.arange(len(photos), dtype=np.float64)
-            mapped = MappedPhotos(features[: len(photos)], detector.model, seconds, truth)
+            mapped = MappedPhotos(features[: len(photos)], seconds, truth)
             names = [str(path.relative_to(folder)) for path in paths]
             asked = features[len(photos) :]
             best = zip(names[len(photos) :], map(mapped.best, asked), strict=True)
@@ -337,7 +332,7 @@ def measure_city(report: Report, count: int, progress: Progress) -> list[tuple[s
     sessions = [(SPRING, count - count // 2), (AUTUMN, count // 2), (WINTER, other), (NIGHT, other)]
     plan = plan_round_trip(3, sessions, outside=other)
     bar = progress.add_task("city", total=2 * len(plan.photos))
-    detector = load_detector("xfeat", torch.device("cpu"))
+    detector = load_detector(torch.device("cpu"))
     with TemporaryDirectory(prefix="placewise-city-") as name:
         folder = Path(name)
         write_city(plan, folder / "city", partial(progress.advance, bar))
@@ -352,7 +347,7 @@ def measure_city(report: Report, count: int, progress: Progress) -> list[tuple[s
     positions = np.array([photo.camera.position for photo in plan.photos])
     middle = positions[members].mean(axis=0) * (1, 1, 0)
     truth = positions - middle
-    mapped = MappedPhotos([features[n] for n in members], detector.model, seconds, truth[members])
+    mapped = MappedPhotos([features[n] for n in members], seconds, truth[members])
     report.add("city: photos", len(members))
     report.add("city: photos in the largest component", len(mapped.components[0].photo_ids))
     per_100 = 100 * mapped.seconds_taken / len(members)
@@ -445,7 +440,7 @@ def measure_floors(
     report: Report, folder: Path, floors: int, progress: Progress
 ) -> list[tuple[str, int, int]]:
     """Report the poses of the floors; return those of the other floors' photos."""
-    detector = load_detector("xfeat", torch.device("cpu"))
+    detector = load_detector(torch.device("cpu"))
     paths = sorted((folder / "database").iterdir())
     queries = sorted((folder / "queries").iterdir())
     names = sorted({_floor(path) for path in paths})[:floors]
@@ -460,7 +455,7 @@ def measure_floors(
     for name in names:
         own = [path for path in paths if _floor(path) == name]
         seconds = np.array([_second(path, paths) for path in own])
-        mapped = MappedPhotos([features[path] for path in own], detector.model, seconds)
+        mapped = MappedPhotos([features[path] for path in own], seconds)
         poses = [mapped.localise(of_queries[path]) for path in queries if _floor(path) == name]
         elsewhere = [path for path in queries if _floor(path) != name]
         accepted = _accepted(mapped.localise(of_queries[path]) for path in elsewhere[::6])

@@ -159,7 +159,8 @@ class AddedModelLoader:
             Unavailable: `model_lost`, `model_corrupt`, `model_unreadable`, and as the store raises
                 it.
         """
-        (name,) = config.added_models
+        name = config.added_model
+        assert name is not None
         with self._catalog.read() as session:
             row = get_model_for_loading(session, name)
         assert row.object_key is not None

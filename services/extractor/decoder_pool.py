@@ -105,7 +105,7 @@ class DecoderPool:
         preprocessing: Preprocessing,
         *,
         previews: Previews = Previews.NONE,
-        detection_channels: int = 0,
+        for_detection: bool = False,
     ) -> list[DecodedPhoto | PlacewiseError]:
         """Decode photos; each result is a decoded photo, or the error that explains the failure.
 
@@ -126,7 +126,7 @@ class DecoderPool:
             preprocessing=preprocessing,
             max_pixels=self._settings.max_image_pixels,
             previews=previews,
-            detection_channels=detection_channels,
+            for_detection=for_detection,
         )
         outcomes: list[DecodedPhoto | PlacewiseError] = []
         pending: deque[tuple[_Decoding, Photo]] = deque()

@@ -107,8 +107,8 @@ def _read_photos(
     photos = _PreparedPhotos(
         lambda pixels: target.extractor.describe(pixels, target.centres, target.projection)
     )
-    channels = features.detector.channels if features and features.missing else 0
-    decoded, photos.failed = _decode_photos(context, batch, batch.jobs, target, channels)
+    for_detection = bool(features and features.missing)
+    decoded, photos.failed = _decode_photos(context, batch, batch.jobs, target, for_detection)
     for job, photo in decoded:
         photos.ready.append(job)
         photos.inputs.append(photo.pixels)
@@ -122,7 +122,7 @@ def _decode_photos(
     batch: JobBatch,
     jobs: Sequence[Job],
     target: ResolvedGeneration,
-    detection_channels: int,
+    for_detection: bool,
 ) -> tuple[list[tuple[Job, DecodedPhoto]], list[tuple[Job, PlacewiseError]]]:
     """Read and decode the photos of some jobs of the batch; return them and the failures.
 
@@ -137,7 +137,7 @@ def _decode_photos(
             [StoredPhoto(store, keys[job.id], *_preview_keys(job)) for job in present],
             target.extractor.preprocessing,
             previews=PREVIEWS_BY_KIND.get(batch.kind, Previews.NONE),
-            detection_channels=detection_channels,
+            for_detection=for_detection,
         )
     decoded: list[tuple[Job, DecodedPhoto]] = []
     failed: list[tuple[Job, PlacewiseError]] = []
@@ -211,8 +211,7 @@ def _read_rows(
     ready = [job for job in batch.jobs if job.photo_id in rows]
     if features and features.missing:
         missing = [job for job in ready if job.id in features.missing]
-        channels = features.detector.channels
-        decoded, failed = _decode_photos(context, batch, missing, target, channels)
+        decoded, failed = _decode_photos(context, batch, missing, target, True)
         for job, photo in decoded:
             features.add_photo(job, photo)
         for job, error in failed:

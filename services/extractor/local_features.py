@@ -1,7 +1,6 @@
 """Local features of the photos of a batch: copied from the active generation, or detected.
 
-A generation has features of one detector: that of its chunks, or LOCAL_FEATURES before the first
-one. A photo whose features can't be computed has none; it is described all the same.
+A photo whose features can't be computed has none; it is described all the same.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from uuid import UUID
 
 from services.extractor.generation_resolver import ResolvedGeneration
 from services.extractor.handlers import ExtractorContext, JobBatch
-from shared.catalog.chunks import find_descriptor_rows, find_features_model
+from shared.catalog.chunks import find_descriptor_rows
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import Matching
@@ -22,8 +21,8 @@ from shared.catalog.reconstructions import find_reconstruction
 from shared.errors import Misconfigured, NotFound
 from shared.imaging.decode import DecodedPhoto
 from shared.jobs import Job, JobKind
-from shared.matching.detectors import Detector
 from shared.matching.features import LocalFeatures
+from shared.matching.xfeat import XFeatDetector
 from shared.storage import ObjectStore
 from shared.storage.chunks import features_key
 from shared.storage.feature_files import FeatureRows, read_feature_index, read_feature_rows
@@ -35,7 +34,7 @@ log = logging.getLogger(__name__)
 class BatchFeatures:
     """Encoded local features of the photos of a batch."""
 
-    detector: Detector
+    detector: XFeatDetector
     missing: set[UUID]
     """Jobs whose features have to be detected."""
     encoded: dict[UUID, bytes]
@@ -79,7 +78,6 @@ def prepare_features(
         return None
     map_id, is_query = batch.jobs[0].map_id, batch.kind == JobKind.DESCRIBE
     with context.catalog.read() as session:
-        model = find_features_model(session, target.generation.id)
         source = active_generation(session, map_id) if batch.kind == JobKind.REINDEX else None
         is_reconstructed = is_query and find_reconstruction(session, map_id) is not None
     uses_matches = target.generation.uses_matches
@@ -91,9 +89,8 @@ def prepare_features(
         return None
     if not missing:
         return None
-    name = model.partition("@")[0] if model else context.settings.local_features
     try:
-        detector = context.models.detector(name)
+        detector = context.models.detector()
     except Misconfigured as error:
         if not is_query:
             raise

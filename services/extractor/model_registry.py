@@ -31,11 +31,11 @@ from shared.descriptors.inference import (
     model_fits_gpu,
 )
 from shared.descriptors.pca_whitening import PcaProjection, decode_whitening
-from shared.descriptors.side_by_side import SideBySideExtractor
 from shared.descriptors.vocabulary import ClusterCentres, decode_centres
 from shared.errors import PlacewiseError, Unavailable
 from shared.extractor_config.configs import ExtractorConfig
-from shared.matching.detectors import Detector, load_detector
+from shared.matching.features import DETECTOR
+from shared.matching.xfeat import XFeatDetector, load_detector
 from shared.storage import ObjectStore
 
 LoadAddedModel = Callable[[ExtractorConfig, torch.device], Backbone]
@@ -150,9 +150,6 @@ class ModelRegistry:
         return self.extractor(generation.extractor, precision)
 
     def _load(self, config: ExtractorConfig, precision: Precision) -> Extractor:
-        if config.parts:
-            parts = [self.extractor(part.name, precision) for part in config.parts]
-            return SideBySideExtractor(config, parts)
         limit = self._pass_limits[config.backbone_key]
         shared_backbone = self._backbones.get(config.backbone_key)
         if shared_backbone is not None:
@@ -165,7 +162,7 @@ class ModelRegistry:
             self._device,
             precision=precision,
             dino_weights=self._settings.dino_weights,
-            backbone=self._load_added(config, self._device) if config.added_models else None,
+            backbone=self._load_added(config, self._device) if config.added_model else None,
             limit=limit,
         )
         self._backbones[config.backbone_key] = extractor.backbone
@@ -174,14 +171,14 @@ class ModelRegistry:
         self._on_load(time.perf_counter() - started)
         return extractor
 
-    def detector(self, name: str) -> Detector:
-        """Return the detector of local features called `name` with its weights loaded.
+    def detector(self) -> XFeatDetector:
+        """Return the detector of local features with its weights loaded.
 
         Raises:
             Misconfigured: as `load_detector`.
         """
-        with self._lock, self._report_load(name):
-            return load_detector(name, self._device)
+        with self._lock, self._report_load(DETECTOR):
+            return load_detector(self._device)
 
     def centres(self, vocabulary: Vocabulary) -> ClusterCentres:
         """Return the vocabulary's centres, verified against the catalog's hash."""
@@ -235,16 +232,11 @@ class ModelRegistry:
 def _ensure_model_row(session: Session, extractor: Extractor) -> Model:
     """Return the catalog's row of the extractor's weights, creating it if needed.
 
-    Of two extractors side by side, it is that of the first.
-
     Raises:
         Misconfigured: `model_missing` if an added model has been removed meanwhile.
     """
-    if isinstance(extractor, SideBySideExtractor):
-        models = [_ensure_model_row(session, part) for part in extractor.parts]
-        return models[0]
     backbone = extractor.backbone
-    for added in extractor.config.added_models:
+    if added := extractor.config.added_model:
         # Locked, because a generation that uses it is created in this transaction.
         return get_model_for_loading(session, added, lock=True)
     return get_or_create_model(

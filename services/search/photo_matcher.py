@@ -1,7 +1,7 @@
 """Matches photos by their local features, which are read from the object store by range.
 
-Products of NumPy pair the keypoints (`shared.matching.matchers`), in a thread for each candidate,
-and poselib verifies the pairs.
+Products of NumPy pair the keypoints (`shared.matching.mutual_nearest`), in a thread for each
+candidate, and poselib verifies the pairs.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from cachetools import LRUCache, cachedmethod
 
 from shared.errors import NotFound
 from shared.matching.features import MIN_SIDE, LocalFeatures
-from shared.matching.matchers import MutualNearest
+from shared.matching.mutual_nearest import match_keypoints
 from shared.matching.verification import verify_matches
 from shared.responses.similarity import PointPair
 from shared.search_api.protocol import (
@@ -74,8 +74,8 @@ class PhotoMatcher:
         found = self.read_features(candidate)
         if found is None or found[0] != query[0]:
             return None
-        (model, first), second = query, found[1]
-        matches = MutualNearest.of_model(model).match(first, second)
+        first, second = query[1], found[1]
+        matches = match_keypoints(first, second)
         is_inlier = verify_matches(
             first.working_pixels()[matches[:, 0]], second.working_pixels()[matches[:, 1]]
         )

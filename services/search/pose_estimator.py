@@ -21,7 +21,6 @@ from shared.geometry.frames import EastNorthUp, Similarity
 from shared.geometry.localise import LocalPose, localise
 from shared.geometry.radius import PoseCalibration, geo_pose
 from shared.matching.features import LocalFeatures
-from shared.matching.matchers import MutualNearest
 from shared.search_api.protocol import (
     MAX_SEEN_POINTS,
     ComponentPose,
@@ -89,7 +88,6 @@ class PoseEstimator:
                 candidates,
                 list(components.values()),
                 *_camera(request, query[1], list(components.values())),
-                MutualNearest.of_model(request.features_model),
                 frozenset(request.leave_out),
             )
         except Unprocessable as error:

@@ -143,16 +143,15 @@ class FeatureCounts:
     photos: int
     size_bytes: int
     missing: int
-    """rows without features of this detector"""
+    """rows without features"""
 
 
-def count_features(session: Session, generation_id: UUID, detector: str) -> FeatureCounts:
+def count_features(session: Session, generation_id: UUID) -> FeatureCounts:
     """Count the local features of the generation."""
-    is_detected = Chunk.features_model.startswith(f"{detector}@")
     columns = (
         Chunk.features_rows,
         Chunk.features_bytes,
-        Chunk.rows - sa.case((is_detected, Chunk.features_rows), else_=0),
+        Chunk.rows - Chunk.features_rows,
     )
     sums = [sa.func.coalesce(sa.func.sum(column), 0) for column in columns]
     live = (Chunk.generation_id == generation_id) & Chunk.superseded_at.is_(None)

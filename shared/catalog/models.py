@@ -48,7 +48,6 @@ class Model(Journaled, Base):
     fingerprint: Mapped[str] = mapped_column(sa.String(64))
     licence: Mapped[str] = mapped_column(sa.Text)
     card: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
-    first_used_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     added_name: Mapped[str | None] = mapped_column(sa.String(100))
     added_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     object_key: Mapped[str | None] = mapped_column(sa.Text)
@@ -133,7 +132,7 @@ def get_registered_model(session: Session, name: str) -> Model:
 
 def check_model_registered(session: Session, config: ExtractorConfig) -> None:
     """Raise NotFound (`model_missing`) if the extractor uses a model that was not added."""
-    for model in config.added_models:
+    if model := config.added_model:
         _get_model(session, str(model.registered), NotFound, prefix=model.prefix)
 
 
@@ -207,7 +206,7 @@ def _uses(extractor: str, model: Model) -> bool:
         config = get_extractor_config(extractor, allow_test_extractors=True)
     except PlacewiseError:  # of another release; one bad name must not hide all models
         return model.name in extractor
-    return model.name in {used.extractor for used in config.added_models}
+    return config.added_model is not None and config.added_model.extractor == model.name
 
 
 def _select_model(name: str, *, lock: bool = False) -> sa.Select[Model]:

@@ -98,11 +98,6 @@ class ExtractorSettings(BaseSettings):
         description="number of decoding processes, unless set a quarter of the processors, at "
         "least 2; with a GPU, all but two of them; with S3, which they wait for, twice as many",
     )
-    local_features: Literal["xfeat", "aliked-n16"] = Field(
-        "xfeat",
-        description="local features of new generations, by which photos are matched: xfeat (at "
-        "most 70 kB a photo) or aliked-n16 (132 kB; slower, better; needs the extra `lightglue`)",
-    )
 
     @field_validator("code_allowed")
     @classmethod
@@ -211,14 +206,13 @@ class ExtractorSettings(BaseSettings):
         """
         config = get_extractor_config(name, allow_test_extractors=self.allow_test_extractors)
         _check_extractor_is_shared(config)
-        for part in config.parts or (config,):
-            if part.hub is not None and part.name not in self.allowed_hub_extractors:
-                raise Misconfigured(
-                    "code_not_allowed",
-                    f"The extractor {part.name} executes code of {part.hub.source}, which is not "
-                    "allowed here. To allow it, the operator adds that exact name to CODE_ALLOWED "
-                    "of the gateway and the extractors, and restarts them.",
-                )
+        if config.hub is not None and config.name not in self.allowed_hub_extractors:
+            raise Misconfigured(
+                "code_not_allowed",
+                f"The extractor {config.name} executes code of {config.hub.source}, which is not "
+                "allowed here. To allow it, the operator adds that exact name to CODE_ALLOWED "
+                "of the gateway and the extractors, and restarts them.",
+            )
         return config
 
     def check_torchscript_allowed(self, name: str, sha256: str) -> None:
@@ -241,17 +235,16 @@ class ExtractorSettings(BaseSettings):
             if name.startswith(TORCHHUB_PREFIX)
         ]
         configured = get_extractor_config(self.new_map_extractor, allow_test_extractors=True)
-        allowed += [part.name for part in configured.parts or (configured,) if part.hub]
+        allowed += [configured.name] if configured.hub else []
         return tuple(dict.fromkeys(allowed))
 
 
 def _check_extractor_is_shared(config: ExtractorConfig) -> None:
     """Raise Misconfigured (`model_not_added`) for a checkpoint that is a file of one machine."""
-    for part in config.parts or (config,):
-        if part.model is not None and part.model.file is not None:
-            raise Misconfigured(
-                "model_not_added",
-                f"{part.model.file} is a file of one machine, but any extractor worker may "
-                "describe a map's photos. Add it with `placewise models add "
-                f"{part.model.file} --name NAME`, and use {part.model.prefix}NAME.",
-            )
+    if config.model is not None and config.model.file is not None:
+        raise Misconfigured(
+            "model_not_added",
+            f"{config.model.file} is a file of one machine, but any extractor worker may "
+            "describe a map's photos. Add it with `placewise models add "
+            f"{config.model.file} --name NAME`, and use {config.model.prefix}NAME.",
+        )

@@ -89,7 +89,6 @@ class Extractor:
         else:
             self.preprocessing = get_preprocessing(config.preprocessing)
         assert config.width in (None, self.backbone.width), "config.width must match the backbone"
-        self.patch_preprocessing = self.preprocessing
 
     def with_precision(self, precision: Precision) -> Extractor:
         """Return an extractor with the same weights that computes in `precision`."""

@@ -50,7 +50,7 @@ def feature_provenance(extractor: Extractor) -> Provenance:
         "backbone_fingerprint": backbone.fingerprint,
         "layer": backbone.layer,
         "facet": backbone.facet,
-        "preprocessing": extractor.patch_preprocessing.as_spec(),
+        "preprocessing": extractor.preprocessing.as_spec(),
     }
 
 

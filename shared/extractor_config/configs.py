@@ -6,7 +6,6 @@
     get_extractor_config("torchhub:/models/mine:my_entry", ...)
     get_extractor_config("gsv:night-walks", ...)
     get_extractor_config("onnx:town:aggregator=vlad,input.size=288x384", ...)
-    get_extractor_config("efficientnet-lite0-vlad128@0.3+torchscript:sscd@0.7", ...)
 
 A name may carry options. In the canonical name, options are in alphabetical order and options with
 the extractor's default are left out, so that each configuration has one name wherever it is stored
@@ -53,8 +52,6 @@ SLOW_TEST_BACKBONE = "test-slow"  # the backbone whose width and time are option
 MAX_WIDTH = 131_072
 MAX_MILLISECONDS = 60_000
 MAX_TEMPERATURE = 1000
-THUMBNAIL_PATCH = 4  # pixels; the side of a patch that `patchnorm` normalises
-MAX_THUMBNAIL_SIDE = 256  # pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,14 +96,7 @@ class ExtractorConfig:
     """The model that computes the descriptors, for `gsv:`, `torchscript:` and `onnx:` names."""
     input: NetworkInput | None = None
     """What an exported network expects; None for other extractors."""
-    parts: tuple[ExtractorConfig, ...] = ()
-    """The two extractors whose rows stand side by side; the other fields are those of the one that
-    needs a vocabulary, or else of the first. Empty for a single extractor."""
-    weights: tuple[float, ...] = ()
-    """Weights of the cosines of `parts`; their sum is 1."""
     for_tests: bool = False
-    size: str | None = None
-    """`WIDTHxHEIGHT` of a thumbnail; None for other extractors."""
     milliseconds: int = 0
     """Simulated time per photo (a sleep), of an extractor for tests."""
 
@@ -121,15 +111,14 @@ class ExtractorConfig:
 
         A generation has its own, which depends on its vocabulary.
         """
-        if self.width is None or self.parts:
+        if self.width is None:
             return None
         return self.width * (self.clusters if self.needs_vocabulary else 1)
 
     @property
-    def added_models(self) -> tuple[ModelName, ...]:
-        """The models that have to be added before the extractor can be used."""
-        models = [part.model for part in self.parts or (self,)]
-        return tuple(model for model in models if model is not None and model.registered)
+    def added_model(self) -> ModelName | None:
+        """The model that has to be added before the extractor can be used."""
+        return self.model if self.model is not None and self.model.registered else None
 
     @property
     def backbone_key(self) -> tuple[object, ...]:
@@ -203,7 +192,6 @@ EXTRACTOR_CONFIGS = {
             parameters=0,
             preprocessing="resize32x64",
             aggregator="none",
-            size="64x32",
         ),
         ExtractorConfig(
             name="test-tiny-avg",
@@ -254,8 +242,6 @@ def get_extractor_config(name: str, *, allow_test_extractors: bool) -> Extractor
             allowed; `bad_extractor_option` with the option, its value and the allowed ones; those
             of `parse_torchhub_name`, `parse_model_name` and `parse_exported_name`.
     """
-    if len(names := SIDE_BY_SIDE.split(name)) > 1:
-        return _side_by_side_config(names, allow_test_extractors)
     if name.startswith(TORCHHUB_PREFIX):
         return _torchhub_config(parse_torchhub_name(name))
     if name.startswith(TRAINED_PREFIX):
@@ -286,66 +272,12 @@ def pooled_config(config: ExtractorConfig) -> ExtractorConfig:
 
     It has the same patch features and preprocessing, and needs no vocabulary.
     """
-    if config.parts:
-        pooled = [pooled_config(p).name if p.needs_vocabulary else p.name for p in config.parts]
-        weighted = [f"{name}@{weight}" for name, weight in zip(pooled, config.weights, strict=True)]
-        return get_extractor_config("+".join(weighted), allow_test_extractors=True)
     base = config.model.extractor if config.model else config.name.partition(":")[0]
     options = config.name[len(base) + 1 :].split(",")
     kept = ("facet=", "layer=", "preprocessing=", "input.")
     shared = [option for option in options if option.startswith(kept)]
     return get_extractor_config(
         f"{base}:{','.join([*shared, 'aggregator=gem'])}", allow_test_extractors=config.for_tests
-    )
-
-
-# A plus sign may also stand in an option or a path.
-SIDE_BY_SIDE = re.compile(
-    rf"\+(?=(?:{'|'.join(EXTRACTOR_CONFIGS)})\b|torchhub:|gsv:|torchscript:|onnx:)"
-)
-
-
-def _side_by_side_config(names: list[str], allow_test_extractors: bool) -> ExtractorConfig:
-    """Return the configuration of `A@WEIGHT+B@WEIGHT`."""
-    title = "+".join(names)
-    parsed = [re.fullmatch(r"(.+?)(?:@([0-9]{1,4}(?:\.[0-9]{1,4})?))?", name) for name in names]
-    parts = tuple(
-        get_extractor_config(match[1], allow_test_extractors=allow_test_extractors)
-        for match in parsed
-        if match
-    )
-    numbers = [float(match[2] or 1) for match in parsed if match]
-    if len(parts) != 2 or min(numbers) <= 0:
-        raise _bad_option_error(f"{title}: two extractors stand side by side, A@WEIGHT+B@WEIGHT.")
-    if all(part.needs_vocabulary for part in parts):
-        raise _bad_option_error(
-            f"{title}: only one of the two may need a vocabulary. Use aggregator=gem for the other."
-        )
-    if any(part.preprocessing in ANYLOC_PREPROCESSING_NAMES for part in parts):
-        raise _bad_option_error(
-            f"{title}: {', '.join(ANYLOC_PREPROCESSING_NAMES)} ignore how EXIF turns a photo, so "
-            "that they can't stand beside another extractor."
-        )
-    share = round(numbers[0] / sum(numbers), 3)
-    if not 0 < share < 1:
-        raise _bad_option_error(
-            f"{title}: each of the two needs a share of at least 0.001 of the weights."
-        )
-    weights = (share, round(1 - share, 3))
-    texts = [
-        p.name + (f"@{w:g}" if share != 0.5 else "") for p, w in zip(parts, weights, strict=True)
-    ]
-    main = parts[int(parts[1].needs_vocabulary)]
-    return replace(
-        main,
-        name=_checked_length("+".join(texts)),
-        preprocessing=None,
-        depth=None,
-        hub=None,
-        model=None,
-        parts=parts,
-        weights=weights,
-        for_tests=any(part.for_tests for part in parts),
     )
 
 
@@ -438,9 +370,6 @@ def _apply_options(base: ExtractorConfig, options: str) -> ExtractorConfig:
                 f"The option {option}={values[option]} of {base.name} can't be used: "
                 f"{option} is {expected}."
             ) from None
-    if config.size is not None:
-        width, height = map(int, config.size.split("x"))
-        config = replace(config, width=width * height, preprocessing=f"resize{height}x{width}")
     changed = {
         option: f"{option}={_format_value(getattr(config, option))}"
         for option in sorted(values)
@@ -489,11 +418,6 @@ def _allowed_options(base: ExtractorConfig, config: ExtractorConfig) -> dict[str
             _integer_between(0, last),
             f"a whole number from 0 to {last} ({base.backbone} has {base.depth} blocks)",
         )
-    if base.size is not None:
-        allowed["size"] = (
-            _parse_thumbnail_size,
-            f"WIDTHxHEIGHT, multiples of {THUMBNAIL_PATCH} up to {MAX_THUMBNAIL_SIDE} pixels",
-        )
     if base.backbone == SLOW_TEST_BACKBONE:
         allowed["milliseconds"] = (
             _integer_between(0, MAX_MILLISECONDS),
@@ -523,14 +447,6 @@ def _one_of(names: tuple[str, ...]) -> OptionParser:
         return value
 
     return parse, f"one of {', '.join(names)}"
-
-
-def _parse_thumbnail_size(value: str) -> str:
-    if not re.fullmatch(r"[1-9][0-9]{0,2}x[1-9][0-9]{0,2}", value):
-        raise ValueError(value)
-    if any(int(s) % THUMBNAIL_PATCH or int(s) > MAX_THUMBNAIL_SIDE for s in value.split("x")):
-        raise ValueError(value)
-    return value
 
 
 def _parse_temperature(value: str) -> float:

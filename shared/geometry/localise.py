@@ -15,7 +15,7 @@ from shared.geometry.absolute_pose import AbsolutePose, LensSigmas, estimate_abs
 from shared.geometry.cameras import Camera, CameraSource, Floats
 from shared.geometry.component import Component
 from shared.matching.features import LocalFeatures
-from shared.matching.matchers import MutualNearest
+from shared.matching.mutual_nearest import match_keypoints
 
 MIN_INLIERS = 30
 MIN_INLIER_SHARE = 0.25
@@ -93,7 +93,6 @@ def localise(
     components: Sequence[Component],
     camera: Camera | None,
     camera_source: CameraSource,
-    matcher: MutualNearest,
     leave_out: AbstractSet[UUID] = frozenset(),
 ) -> LocalPose:
     """Return the pose of a photo; Unprocessable (`no_pose`) says why it has none.
@@ -105,7 +104,6 @@ def localise(
         components: Of the model.
         camera: The camera of the photo, at its size; None if its focal length is unknown.
         camera_source: Where `camera` comes from; ESTIMATED without one.
-        matcher: For features of this model.
         leave_out: Photos that are treated as if they were not in the components.
     """
     longer, shorter = max(query.width, query.height), min(query.width, query.height)
@@ -118,7 +116,7 @@ def localise(
         raise Unprocessable("no_pose", "None of the best photos of the map is in the model.")
     pixels = query.pixels() if camera is None else camera.undistort(query.pixels())
     groups = [
-        _match(query, pixels, group, components, matcher, leave_out)
+        _match(query, pixels, group, components, leave_out)
         for group in _group_by_place(places, components)
     ]
     groups = sorted(groups, key=lambda pairs: -len(pairs.pixels))[:MAX_PLACES]
@@ -271,7 +269,6 @@ def _match(
     pixels: Floats,
     group: Sequence[tuple[int, int, LocalFeatures]],
     components: Sequence[Component],
-    matcher: MutualNearest,
     leave_out: AbstractSet[UUID],
 ) -> _Pairs:
     """Match the query with the photos of a place; each pair counts once.
@@ -284,7 +281,7 @@ def _match(
     is_seen = _seen_by_others(component, leave_out)
     found = [np.empty((0, 2), np.int64)]
     for _, row, features in group:
-        matches = matcher.match(query, features)
+        matches = match_keypoints(query, features)
         points = component.point_numbers[row][matches[:, 1]]
         is_point = (points >= 0) & is_seen[points]
         found.append(np.column_stack([matches[is_point, 0], points[is_point]]))

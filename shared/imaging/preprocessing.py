@@ -27,7 +27,6 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -244,25 +243,6 @@ def _centre_crop(pixels: Pixels) -> Pixels:
     top, left = round((pixels.shape[0] - height) / 2), round((pixels.shape[1] - width) / 2)
     cropped: Pixels = pixels[top : top + height, left : left + width].copy()
     return cropped
-
-
-def both_preprocessings(first: Preprocessing, second: Preprocessing) -> Preprocessing:
-    """Return a preprocessing for two networks: `apply` returns an object array of both pixels."""
-    return Preprocessing(
-        f"{first.name}+{second.name}",
-        max(first.version, second.version),
-        first.upright,
-        first.max_pixels + second.max_pixels,
-        first.typical_size,
-        partial(_resize_both, first=first, second=second),
-    )
-
-
-def _resize_both(image: Image.Image, first: Preprocessing, second: Preprocessing) -> Pixels:
-    both = np.empty(2, dtype=object)
-    both[0] = first.apply(image)
-    both[1] = both[0] if first.name == second.name else second.apply(image)
-    return cast("Pixels", both)
 
 
 def _area_preprocessing(height: int, width: int) -> Preprocessing:

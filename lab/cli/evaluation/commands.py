@@ -324,15 +324,12 @@ def compare(
         typer.Option(
             "--extractor",
             metavar="NAME",
-            help="Map: another extractor, such as A+B or torchscript:/PATH. Can be repeated.",
+            help="Map: another extractor, such as torchscript:/PATH. Can be repeated.",
         ),
     ] = None,
     photos: Annotated[
         int, typer.Option("--photos", min=20, help="Map: number of photos that are described.")
     ] = 1000,
-    weights: Annotated[
-        bool, typer.Option("--weights", help="Map: choose the weights of each A+B on its photos.")
-    ] = False,
     map_name: MapOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -346,7 +343,7 @@ def compare(
 
         options = {"--set": set_name, "--protocol": protocol, "--rule": rule, "--out": out}
         _reject_options("without DIR", {"--extractors": extractors, **options})
-        compare_on_map(map_name, extractor, photos, weights, as_json)
+        compare_on_map(map_name, extractor, photos, as_json)
         return
     if extractors is None:
         raise InvalidRequest("bad_extractors", "A data set requires --extractors.")

@@ -43,7 +43,7 @@ from shared.descriptors.inference import inference_clock
 from shared.descriptors.pca_fit import check_pca_fittable, fit_pca_stream, sample_rows, sample_size
 from shared.descriptors.pca_whitening import PcaProjection
 from shared.errors import InvalidRequest
-from shared.extractor_config.configs import MAX_PCA_DIMENSION, SIDE_BY_SIDE, get_extractor_config
+from shared.extractor_config.configs import MAX_PCA_DIMENSION, get_extractor_config
 
 BLOCK_BYTES = 64_000_000
 SEED = 0
@@ -116,8 +116,7 @@ def parse_entries(text: str) -> list[ComparisonEntry]:
 
 def _parse_entry(spec_text: str) -> ComparisonEntry:
     name, fit, pca = spec_text, False, None
-    # What follows another plus sign is an extractor that stands beside the first.
-    while (found := name.rpartition("+"))[1] and not SIDE_BY_SIDE.match("+" + found[2]):
+    while (found := name.rpartition("+"))[1]:
         name, _, addition = found
         match = PCA_SUFFIX.fullmatch(addition)
         if addition == "fit":

@@ -59,7 +59,6 @@ from shared.storage import ObjectStore
 from shared.storage.open_store import open_store
 
 SEED = 0
-TRIED_WEIGHTS = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8, 0.1, 0.9)  # the first of the best is chosen
 RECALLS = {
     "labelled_queries": "labelled queries",
     "leave_one_out_without_sequence": "own photos, without those of their sequence",
@@ -154,8 +153,8 @@ class MapComparison:
             snapshot_version=request.min_version,
         )
 
-    def compare(self, name: str, *, choose_weights: bool) -> dict[str, Any]:
-        """Evaluate an extractor; the weights of two side by side may be chosen on own photos.
+    def compare(self, name: str) -> dict[str, Any]:
+        """Evaluate an extractor.
 
         Returns:
             `extractor`; `queries` and their number; `recall_at_1`, `answered` and `right` with
@@ -163,36 +162,28 @@ class MapComparison:
             switches the map, None for the extractor in use.
         """
         config = self._config(name)
-        if choose_weights and config.parts:
-            first, second = (part.name for part in config.parts)
-            tried = [f"{first}@{w}+{second}@{round(1 - w, 1)}" for w in TRIED_WEIGHTS]
-            recalls = [self._recall(self._evaluate(n) | {"labelled_queries": None}) for n in tried]
-            config = self._config(tried[int(np.argmax([recall for _, _, recall in recalls]))])
-        figures = self._evaluate(config.name)
+        described = self._describe(config)
+        self._scores = described.scores
+        self._bar = self._progress.add_task(f"{config.name}: searching", total=len(self._photos))
+        figures = self.evaluation.evaluate(self.evaluation.database.photos).figures
         queries, count, recall = self._recall(figures)
         hits = round(recall * count)
         answers = (figures["places"] or {"answers": []})["answers"]
         answer = {each["certainty"]: each for each in answers}.get(DECISIVE_CERTAINTY, {})
-        _, cpu_seconds, dimension = self._describe(config)
         return {
             "extractor": config.name,
             "queries": f"{count} {queries}",
             "recall_at_1": share_with_interval([True] * hits + [False] * (count - hits)),
             "answered": answer.get("answered", UNKNOWN),
             "right": answer.get("precision", UNKNOWN),
-            "cpu_seconds": cpu_seconds,
-            "bytes": dimension * np.dtype(str(self._generation.row_type)).itemsize,
+            "cpu_seconds": described.cpu_seconds,
+            "bytes": described.dimension * np.dtype(str(self._generation.row_type)).itemsize,
             "switch": self._switch_command(config),
         }
 
     def _config(self, name: str) -> ExtractorConfig:
         allowed = self._settings.allow_test_extractors
         return get_extractor_config(name, allow_test_extractors=allowed)
-
-    def _evaluate(self, name: str) -> dict[str, Any]:
-        self._scores = self._describe(self._config(name)).scores
-        self._bar = self._progress.add_task(f"{name}: searching", total=len(self._photos))
-        return self.evaluation.evaluate(self.evaluation.database.photos).figures
 
     def _recall(self, figures: dict[str, Any]) -> tuple[str, int, float]:
         """Return what was searched with, how often, and R@1."""
@@ -208,14 +199,6 @@ class MapComparison:
     def _describe(self, config: ExtractorConfig) -> Described:
         if config.name not in self.described:
             is_in_use = config.name == self._generation.extractor
-            if config.parts and not is_in_use:
-                first, second = (self._describe(part) for part in config.parts)
-                a, b = config.weights
-                return Described(
-                    np.float32(a) * first.scores + np.float32(b) * second.scores,
-                    first.cpu_seconds + second.cpu_seconds,
-                    first.dimension + second.dimension,
-                )
             pipeline = self._in_use if is_in_use else self._load(config)
             self.described[config.name] = self._describe_with(pipeline)
         return self.described[config.name]
@@ -260,22 +243,14 @@ class MapComparison:
         return self._store.get(self._keys[photo_id])  # NotFound: deleted since
 
     def _uses_own_vocabulary(self, config: ExtractorConfig) -> bool:
-        """Whether the vocabulary in use is of the part that needs one."""
-        needing = [
-            part.name
-            for each in (config, self._in_use.extractor.config)
-            for part in each.parts or (each,)
-            if part.needs_vocabulary
-        ]
-        return len(needing) == 2 and needing[0] == needing[1]
+        return config.needs_vocabulary and config.name == self._in_use.extractor.config.name
 
     def _switch_command(self, config: ExtractorConfig) -> str | None:
         if config.name == self._generation.extractor:
             return None
         home, options = self._settings.placewise_home, ["--extractor", config.name]
-        for part in config.parts or (config,):
-            if part.model is not None and part.model.file is not None:
-                return command_line("models", "add", part.model.file, "--name", "NAME", home=home)
+        if config.model is not None and config.model.file is not None:
+            return command_line("models", "add", config.model.file, "--name", "NAME", home=home)
         if self._uses_own_vocabulary(config):
             options += ["--vocabulary", str(self._generation.vocabulary_id)]
         elif config.needs_vocabulary and config.shipped_vocabulary is None:
@@ -288,7 +263,6 @@ def compare_on_map(
     map_name: str | None,
     extractors: Sequence[str] | None,
     photos: int,
-    choose_weights: bool,
     as_json: bool,
 ) -> None:
     """Compare the extractors at hand, and others, on a map, and print the comparison.
@@ -314,7 +288,7 @@ def compare_on_map(
         )
         for name in dict.fromkeys([*comparison.at_hand, *(extractors or [])]):
             try:
-                compared.append(comparison.compare(name, choose_weights=choose_weights))
+                compared.append(comparison.compare(name))
             except PlacewiseError as error:
                 if not compared:  # the extractor in use
                     raise

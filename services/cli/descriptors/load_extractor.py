@@ -17,7 +17,6 @@ from shared.config.settings import Settings
 from shared.descriptors.backbones import Backbone
 from shared.descriptors.extractor import Extractor, choose_device
 from shared.descriptors.inference import choose_precision
-from shared.descriptors.side_by_side import SideBySideExtractor
 from shared.errors import Misconfigured
 from shared.extractor_config.configs import ExtractorConfig
 from shared.extractor_config.names import TORCHSCRIPT_PREFIX
@@ -31,8 +30,6 @@ def load_extractor(config: ExtractorConfig, settings: Settings) -> Extractor:
     Raises:
         Misconfigured: The weights are missing or don't fit; `model_missing`, `code_not_allowed`.
     """
-    if config.parts:
-        return SideBySideExtractor(config, [load_extractor(p, settings) for p in config.parts])
     device = choose_device(settings.device)
     return Extractor(
         config,

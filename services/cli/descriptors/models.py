@@ -177,8 +177,6 @@ def fetch(
     config = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
     if config.for_tests:
         raise Misconfigured("no_weights", f"The extractor {config.name} has no weights.")
-    if config.parts:
-        raise Misconfigured("no_weights", "Fetch the weights of each of the two by its own name.")
     if config.model is not None:
         raise Misconfigured(
             "no_weights",

@@ -30,7 +30,6 @@ from shared.geometry.radius import (
     normal_radii,
 )
 from shared.matching.features import WORKING_SIDE, LocalFeatures
-from shared.matching.matchers import MutualNearest
 
 CANDIDATES = 10
 NEIGHBOUR_SECONDS = 2.0
@@ -111,7 +110,6 @@ class ComponentPhotos:
 
 def localise_left_out(
     photos: ComponentPhotos,
-    matcher: MutualNearest,
     on_progress: Callable[[int], None],
     threads: int = min(os.cpu_count() or 1, 4),
     *,
@@ -143,7 +141,6 @@ def localise_left_out(
                 [(component.photo_ids[i], features[component.photo_ids[i]]) for i in best.tolist()],
                 [_without(component, np.flatnonzero(near), features)],
                 *photos.query_camera(row, knows_lens),
-                matcher,
                 frozenset(component.photo_ids[i] for i in np.flatnonzero(near).tolist()),
             )
         except Unprocessable:
@@ -288,7 +285,7 @@ def _quantile(ratios: Floats, level: float, normal: float) -> float:
 
 
 def calibrate_components(
-    parts: Sequence[ComponentPhotos], matcher: MutualNearest, on_progress: Callable[[float], None]
+    parts: Sequence[ComponentPhotos], on_progress: Callable[[float], None]
 ) -> list[PoseCalibration]:
     """Calibrate the poses in each component, of queries by other lenses and by those of the map.
 
@@ -303,9 +300,9 @@ def calibrate_components(
 
     found: list[PoseCalibration] = []
     for part, count in zip(parts, counts, strict=True):
-        any_lens = calibrate(localise_left_out(part, matcher, report))
+        any_lens = calibrate(localise_left_out(part, report))
         done += count
-        known = localise_left_out(part, matcher, report, knows_lens=True)
+        known = localise_left_out(part, report, knows_lens=True)
         done += count
         found.append(
             any_lens.model_copy(update={"known_lens": calibrate(known) if known else None})

@@ -64,7 +64,6 @@ from shared.jobs.progress import JobProgress
 from shared.jobs.runner import JobInterrupted
 from shared.jobs.transitions import succeed_job
 from shared.matching.features import LocalFeatures
-from shared.matching.matchers import MutualNearest
 from shared.place_paths import label_levels
 from shared.storage.chunks import features_key, read_chunk
 from shared.storage.feature_files import read_feature_index, read_feature_rows
@@ -217,7 +216,6 @@ class ReconstructionJob:
             match_pairs,
             {id_: photo.features for id_, photo in photos.items()},
             pairs,
-            MutualNearest.of_model(made.features_model),
             on_progress=report,
             check=self._progress.check,
         )
@@ -448,9 +446,8 @@ class ReconstructionJob:
                 None if alignment is None else alignment.similarity,
             )
             parts.append(part)
-        matcher = MutualNearest.of_model(made.features_model)
         return run_in_child(
-            calibrate_components, parts, matcher, on_progress=report, check=self._progress.check
+            calibrate_components, parts, on_progress=report, check=self._progress.check
         )
 
     def _end_step(self, session: Session) -> None:

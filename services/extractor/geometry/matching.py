@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from services.extractor.geometry.pairs import Pairs
 from shared.geometry.component import UNREADABLE
 from shared.matching.features import LocalFeatures
-from shared.matching.matchers import MutualNearest
+from shared.matching.mutual_nearest import match_keypoints
 from shared.matching.verification import verify_matches
 
 MIN_INLIERS = 15
@@ -87,7 +87,6 @@ class VerifiedMatches:
 def match_pairs(
     photos: Mapping[UUID, LocalFeatures],
     pairs: Pairs,
-    matcher: MutualNearest,
     on_progress: Callable[[int], None],
     threads: int = min(os.cpu_count() or 1, 4),
 ) -> VerifiedMatches:
@@ -101,7 +100,7 @@ def match_pairs(
 
     def match(pair: Sequence[int]) -> NDArray[np.uint16]:
         one, other = features[pair[0]], features[pair[1]]
-        matches = matcher.match(one, other)
+        matches = match_keypoints(one, other)
         is_inlier = verify_matches(
             one.working_pixels()[matches[:, 0]], other.working_pixels()[matches[:, 1]]
         )

@@ -25,6 +25,7 @@ from shared.catalog.processes import PROCESS_TIMEOUT_SECONDS, list_processes
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, StorageFull, TooManyRequests
 from shared.jobs.queue_depth import QueueDepth
+from shared.matching.features import DETECTOR
 from shared.responses import ResponseModel
 from shared.storage.trash import read_hold
 
@@ -302,7 +303,7 @@ def _check_messages(gateway: GatewayContext, depth: QueueDepth) -> QueueStatus:
 def _check_extractors(gateway: GatewayContext, depth: QueueDepth) -> ExtractorsStatus:
     with gateway.catalog.read() as session:
         extractors = [p for p in list_processes(session) if p.role == "extractor"]
-        used = {*list_extractors_in_use(session), gateway.settings.local_features}
+        used = {*list_extractors_in_use(session), DETECTOR}
         overdue = is_job_overdue(session, PROCESS_TIMEOUT_SECONDS)
         failed = count_failed_photos(session)
     details: dict[str, str] = {}

@@ -177,7 +177,6 @@ def update_map(gateway: GatewayDep, name: MapNamePath, body: UpdateMapRequest) -
     `matching: on` starts a model change (`model_change_id`) that computes missing local features
     and keeps the descriptors, while searches continue; 409 while another model change runs.
     """
-    detector = gateway.settings.local_features
 
     def update(session: Session) -> MapResponse:
         map_ = lock_map(session, get_map(session, name).id)
@@ -197,7 +196,7 @@ def update_map(gateway: GatewayDep, name: MapNamePath, body: UpdateMapRequest) -
             map_.elsewhere = body.elsewhere
         active = active_generation(session, map_.id)
         is_on = body.matching == Matching.ON
-        if is_on and active and count_features(session, active.id, detector).missing:
+        if is_on and active and count_features(session, active.id).missing:
             start_reindex(session, active)
         session.flush()
         return _map_response(session, gateway.settings, map_)
@@ -246,16 +245,14 @@ def _map_response(session: Session, settings: Settings, map_: Map) -> MapRespons
         vocabulary=vocabulary_standing(session, generation) if generation else None,
         dimension=generation.dimension if generation else None,
         pca_from=generation.pca_from if generation else None,
-        local_features=_local_features(session, settings, generation) if generation else None,
+        local_features=_local_features(session, generation) if generation else None,
         model_change_id=change.id if change else None,
         next_fit_photos=next_fit_photos(session, map_),
     )
 
 
-def _local_features(
-    session: Session, settings: Settings, generation: Generation
-) -> LocalFeaturesResponse:
-    counts = count_features(session, generation.id, settings.local_features)
+def _local_features(session: Session, generation: Generation) -> LocalFeaturesResponse:
+    counts = count_features(session, generation.id)
     return LocalFeaturesResponse(
         model=find_features_model(session, generation.id),
         photos=counts.photos,

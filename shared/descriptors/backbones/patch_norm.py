@@ -16,9 +16,9 @@ from typing import Any
 import torch
 
 from shared.descriptors.backbones import Backbone, StoredWeights, normalise_features
-from shared.extractor_config.configs import THUMBNAIL_PATCH as PATCH
 from shared.extractor_config.configs import ExtractorConfig
 
+PATCH = 4  # pixels; the side of a patch
 MIN_STD = 64.0
 """Standard deviation in grey levels; a patch below is noise and is not scaled up to 1"""
 

@@ -69,7 +69,7 @@ def test_photos_without_readable_features_of_the_query_s_model_are_left_out(
     query, kept, empty, broken = put_features(store, same, view, None, view)
     whole = store.get(query.object_key)
     store.put(query.object_key, whole[:-1])
-    (other_model,) = put_features(store, view, model="aliked-n16@0123456789ab")
+    (other_model,) = put_features(store, view, model="other@0123456789ab")
     (no_file,) = put_features(store, view)
     store.put(no_file.object_key, b"PWF1 and then something else")
     (huge_row,) = put_features(store, view)

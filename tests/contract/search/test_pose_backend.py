@@ -197,7 +197,7 @@ def test_query_without_a_pose_gets_the_reason(
     changes: dict[str, dict[str, Any]] = {
         "no texture": {"query": LocalFeatures.empty((640, 480), 64)},
         "small": {"query": LocalFeatures.empty((8, 8), 64)},
-        "other model": {"features_model": "aliked-n16@0123456789ab"},
+        "other model": {"features_model": "other@0123456789ab"},
         "other photos": {"candidates": candidates[:1]},
         "only itself": {"candidates": candidates[:2], "leave_out": (candidates[1].photo_id,)},
         "other place": {"query": scene_features(1)},

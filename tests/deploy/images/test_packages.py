@@ -38,8 +38,8 @@ COMMAND = [
 LAB_COMMAND = "import sys; sys.argv = ['placewise', 'train', '--help']; main()"
 LOAD_XFEAT = """
 import torch
-from shared.matching.detectors import load_detector
-print(load_detector("xfeat", torch.device("cpu")).model)
+from shared.matching.xfeat import load_detector
+print(load_detector(torch.device("cpu")).model)
 """
 IMPORT = """
 import importlib, sys

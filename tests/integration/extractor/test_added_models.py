@@ -515,35 +515,3 @@ def test_options_that_no_network_has_fail_with_those_that_exist(service: Service
     assert "input.size, input.mean" in failed(service, sent, "bad_extractor_option")
     field_refused(send_exported(service, b"any", "net.onnx", options="x" * 201), "options")
     field_refused(switch(service, extractor=f"onnx:/etc/passwd:{SIZE}"), "extractor")
-
-
-def test_two_extractors_side_by_side_describe_a_map_with_one_vocabulary(
-    allowing: Service, tmp_path: Path
-) -> None:
-    data = onnx_of(tiny_network(), tmp_path)
-    added = done(allowing, send_exported(allowing, data, "net.onnx"))["extractor"]
-    name = f"test-tiny-vlad@0.4+{added}@0.6"
-    allowing.json("POST", "/maps", 201, json={"name": "both", "extractor": name})
-    missing = {"name": "none", "extractor": "test-tiny-avg+onnx:nobody"}
-    problem(allowing("POST", "/maps", json=missing), 404, "model_missing")
-    ids = allowing.indexed(*range(3 * PHOTOS), map_name="both")
-    pooled = active(allowing, "both")
-    assert pooled.extractor == f"test-tiny-vlad:aggregator=gem@0.4+{added}@0.6"
-    assert pooled.dimension == 16 + DIMENSION
-    fitted = allowing("POST", "/vocabularies", params={"map": "both"}, json={})
-    words = done(allowing, fitted, "both")["clusters"]
-    generation = active(allowing, "both")
-    assert generation.extractor == name
-    assert generation.dimension == 16 * words + DIMENSION
-    rows = stored_rows(allowing.catalog, allowing.store, generation.id)
-    first, second = (rows[UUID(photo_id)][-DIMENSION:].astype(np.float32) for photo_id in ids[:2])
-    assert np.linalg.norm(first) == pytest.approx(0.6**0.5, abs=1e-3)
-    assert not np.allclose(first, second, atol=1e-3)
-    found = allowing.json("POST", f"/similarity/{ids[1]}", params={"map": "both", "top_k": 1})
-    assert found["similar_images"][0]["image_id"] != ids[1]
-    used = problem(allowing("DELETE", "/models/tiny"), 409, "model_in_use")
-    assert used["maps"] == ["both"]
-    shorter = switch(allowing, "both", pca=4)
-    assert done(allowing, shorter, "both")["pca"]["from_dimension"] == 16 * words + DIMENSION
-    again = allowing.json("POST", f"/similarity/{ids[1]}", params={"map": "both", "top_k": 1})
-    assert again["similar_images"][0]["image_id"] != ids[1]

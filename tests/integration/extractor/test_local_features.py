@@ -9,18 +9,19 @@ from uuid import UUID
 import numpy as np
 import pytest
 from PIL import Image
-from sqlalchemy import select, update
+from sqlalchemy import select
 
-from services.extractor import publish
+from services.extractor import model_registry, publish
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map, Matching
 from shared.descriptors.extractor import Extractor
+from shared.errors import Misconfigured
 from shared.jobs import JobKind, JobState
 from shared.jobs.model_changes import start_reindex
 from shared.jobs.runner import reclaim_expired_leases
 from shared.matching.features import LocalFeatures
-from shared.matching.matchers import MutualNearest
+from shared.matching.mutual_nearest import match_keypoints
 from shared.matching.verification import verify_matches
 from shared.storage.chunks import features_key
 from shared.storage.feature_files import read_feature_index, read_feature_rows
@@ -103,7 +104,7 @@ def test_photos_get_features_in_pixels_of_the_upright_photo(harness: Harness) ->
     assert first is not None
     assert second is not None
     assert (second.width, second.height) == scene.size
-    pairs = MutualNearest(0.9).match(first, second)
+    pairs = match_keypoints(first, second)
     assert len(pairs) > 100
     points = first.pixels()[pairs[:, 0]], second.pixels()[pairs[:, 1]]
     np.testing.assert_allclose(*points, atol=0.5)
@@ -120,7 +121,7 @@ def test_shifted_copy_of_a_photo_matches_it_and_another_photo_does_not(harness: 
         first, second = found[one], found[other]
         assert first is not None
         assert second is not None
-        pairs = MutualNearest(0.82).match(first, second)
+        pairs = match_keypoints(first, second)
         points = first.working_pixels()[pairs[:, 0]], second.working_pixels()[pairs[:, 1]]
         return int(verify_matches(*points).sum())
 
@@ -262,7 +263,7 @@ def test_model_change_copies_the_features_of_the_active_generation(
     harness.drain()
     before = features_of(harness)
     detected: list[int] = []
-    detector = harness.worker.context.models.detector("xfeat")
+    detector = harness.worker.context.models.detector()
     detect = detector.detect
 
     def count(*photo: Any) -> list[LocalFeatures]:
@@ -308,12 +309,17 @@ def test_generation_of_a_map_that_gains_nothing_by_matches_gets_no_features(
     assert set(keypoints(harness).values()) == {None}
 
 
-def test_unknown_detector_of_a_map_stops_its_photos_and_not_its_queries(harness: Harness) -> None:
+def test_missing_weights_of_local_features_stop_photos_and_not_queries(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
     harness.upload_bytes(photo_bytes(1))
     harness.drain()
     decide(harness, uses_matches=True)
-    with harness.catalog.write() as session:
-        session.execute(update(Chunk).values(features_model="retired@1"))
+
+    def miss(_: Any) -> None:
+        raise Misconfigured("weights_missing", "There are none.")
+
+    monkeypatch.setattr(model_registry, "load_detector", miss)
     query = harness.ask(texture_bytes(2))
     set_columns(harness.catalog, query, params={"filename": "x", "search_params": {}})
     _, job_id = harness.upload_bytes(texture_bytes(3))
@@ -322,5 +328,5 @@ def test_unknown_detector_of_a_map_stops_its_photos_and_not_its_queries(harness:
     job = harness.job(job_id)
     assert job.state == JobState.QUEUED
     assert job.error is not None
-    assert job.error["code"] == "unknown_detector"
-    assert harness.worker.state()["errors"] == {"retired": "unknown_detector"}
+    assert job.error["code"] == "weights_missing"
+    assert harness.worker.state()["errors"] == {"xfeat": "weights_missing"}

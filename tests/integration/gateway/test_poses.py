@@ -246,7 +246,7 @@ def test_query_without_a_pose_is_answered_with_the_reason(
         reconstruct(service, scene, ids)
     if case == "features of another model":
         with service.catalog.write() as session:
-            session.query(Chunk).update({"features_model": "aliked-n16@0123456789ab"})
+            session.query(Chunk).update({"features_model": "other@0123456789ab"})
     elif case == "matching off":
         with service.catalog.write() as session:
             session.query(Map).one().matching = Matching.OFF

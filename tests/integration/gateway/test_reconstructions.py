@@ -157,9 +157,9 @@ def test_reconstruction_of_other_local_features_is_not_current(
     add(service, finished_at=None)
     assert service.json("GET", "/reconstructions")["reconstruction_id"] == str(current.id)
     with service.catalog.write() as session:
-        session.get_one(Reconstruction, current.id).features_model = "aliked-n16@1"
+        session.get_one(Reconstruction, current.id).features_model = "other@1"
     answer = problem(service("GET", "/reconstructions"), 404, "no_reconstruction")
-    assert "of local features of aliked-n16@1" in answer["detail"]
+    assert "of local features of other@1" in answer["detail"]
 
 
 def test_proposals_are_accepted_and_undone_by_changing_the_photo(

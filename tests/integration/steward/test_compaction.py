@@ -113,7 +113,7 @@ FEATURES = ("xfeat@1", [b"one", b"two"])
         (FEATURES, ("xfeat@1", [b"", b"four"]), ("xfeat@1", [b"two", b"", b"four"])),
         (FEATURES, None, ("xfeat@1", [b"two", b"", b""])),
         (None, FEATURES, ("xfeat@1", [b"", b"one", b"two"])),
-        (FEATURES, ("aliked-n16@1", [b"", b"four"]), ("aliked-n16@1", [b"", b"", b"four"])),
+        (FEATURES, ("other@1", [b"", b"four"]), ("other@1", [b"", b"", b"four"])),
         (None, None, None),
     ],
 )

@@ -79,7 +79,7 @@ def test_reconstructions_that_were_replaced_or_given_up_go_after_the_grace(
             for at in (datetime.now(UTC), long_ago)
         )
         replaced = add(finished_at=long_ago)
-        of_other_features = add(features_model="aliked@1", finished_at=long_ago)
+        of_other_features = add(features_model="other@1", finished_at=long_ago)
         last_but_one, last = add(finished_at=long_ago), add()
         running, retried, given_up = (
             add(finished_at=None, job_id=one.id) for one in (job, failed, failed_long_ago)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
 
@@ -213,49 +212,3 @@ def test_the_pooled_form_of_a_vlad_extractor_keeps_its_local_features(
     assert found.backbone_key == config(name).backbone_key
     assert found.preprocessing == config(name).preprocessing
     assert not found.needs_vocabulary
-
-
-@pytest.mark.parametrize(
-    ("written", "canonical"),
-    [
-        ("patchnorm@1+test-tiny-vlad@1.0", "patchnorm+test-tiny-vlad"),
-        ("patchnorm@3+test-tiny-avg@7", "patchnorm@0.3+test-tiny-avg@0.7"),
-        (
-            "test-tiny-vlad:clusters=4+onnx:town:input.range=255",
-            "test-tiny-vlad:clusters=4+onnx:town:input.range=255",
-        ),
-        ("gsv:a+torchscript:b@0.25", "gsv:a@0.8+torchscript:b@0.2"),
-    ],
-)
-def test_two_extractors_side_by_side_have_one_canonical_name(written: str, canonical: str) -> None:
-    config = get_extractor_config(written, allow_test_extractors=True)
-    assert config.name == canonical
-    assert get_extractor_config(canonical, allow_test_extractors=True) == config
-    assert sum(config.weights) == 1
-    assert config.needs_vocabulary == ("vlad" in canonical)
-    assert len(config.added_models) == len(re.findall("onnx|gsv|torchscript", canonical))
-
-
-@pytest.mark.parametrize(
-    ("name", "code"),
-    [
-        ("test-tiny-vlad+test-tiny-vlad", "bad_extractor_option"),
-        ("patchnorm+patchnorm+patchnorm", "bad_extractor_option"),
-        ("patchnorm@0+test-tiny-avg@1", "bad_extractor_option"),
-        ("onnx:a@0.0001+onnx:b@9999", "bad_extractor_option"),
-        ("onnx:a@9999+onnx:b@1", "bad_extractor_option"),
-        ("patchnorm+anyloc-vits14:aggregator=gem,preprocessing=round14", "bad_extractor_option"),
-        ("patchnorm+nobody", "unknown_extractor"),
-        ("+patchnorm", "bad_extractor_option"),
-        ("patchnorm+onnx:a/b", "bad_model_name"),
-    ],
-)
-def test_two_extractors_that_can_not_stand_side_by_side_are_refused(name: str, code: str) -> None:
-    with pytest.raises(Misconfigured) as caught:
-        get_extractor_config(name, allow_test_extractors=True)
-    assert caught.value.code == code
-
-
-def test_until_it_has_a_vocabulary_a_part_is_pooled_beside_the_other() -> None:
-    config = get_extractor_config("anyloc-vits14@0.3+patchnorm@0.7", allow_test_extractors=False)
-    assert pooled_config(config).name == "anyloc-vits14:aggregator=gem@0.3+patchnorm@0.7"

@@ -14,10 +14,8 @@ from shared.geometry.cameras import Camera, CameraSource
 from shared.geometry.component import Component
 from shared.geometry.localise import LocalPose, localise
 from shared.matching.features import FULL_SIDE, LocalFeatures
-from shared.matching.matchers import MutualNearest
 from tests.support.reconstructed_scene import CAMERA, ReconstructedScene, looking
 
-MATCHER = MutualNearest(0.9)
 CENTRE = np.array([0.7, -0.5, 0.3])
 ROTATION = looking(CENTRE, np.array([1.0, 11.0, 0.5]))
 
@@ -41,7 +39,7 @@ def locate(
     """Localise a photo, whose camera is given or estimated, among those of the scene."""
     source = CameraSource.GIVEN if camera else CameraSource.ESTIMATED
     components = [component or scene.component]
-    return localise(query, scene.candidates, components, camera, source, MATCHER, leave_out)
+    return localise(query, scene.candidates, components, camera, source, leave_out)
 
 
 @pytest.mark.parametrize("focal", [350.0, 500.0, 800.0])
@@ -107,7 +105,7 @@ def test_photos_that_are_left_out_are_not_used(scene: ReconstructedScene) -> Non
 def test_photo_of_another_scene_has_no_pose(scene: ReconstructedScene) -> None:
     query, _ = ReconstructedScene(seed=1).take(ROTATION, CENTRE)
     assert reason(query, scene).endswith(".")
-    rest = [scene.component], None, CameraSource.ESTIMATED, MATCHER
+    rest = [scene.component], None, CameraSource.ESTIMATED
     with pytest.raises(Unprocessable, match="None of the best photos of the map is in the model"):
         localise(query, [], *rest)
 
@@ -170,7 +168,7 @@ def test_place_that_exists_twice_is_no_pose(scene: ReconstructedScene) -> None:
     )
     candidates = [*scene.candidates, *((names[p], f) for p, f in scene.candidates)]
     with pytest.raises(Unprocessable, match="Two places of the model explain the photo"):
-        localise(query, candidates, [twice], CAMERA, CameraSource.GIVEN, MATCHER)
+        localise(query, candidates, [twice], CAMERA, CameraSource.GIVEN)
     # The photos of one of the two alone know no other place.
     locate(query, scene, CAMERA, twice)
 
@@ -207,4 +205,4 @@ def test_features_of_another_detection_are_ignored(scene: ReconstructedScene) ->
     fewer = [(p, keep(f, np.arange(len(f.positions) - 1))) for p, f in scene.candidates]
     source = CameraSource.GIVEN
     with pytest.raises(Unprocessable):
-        localise(query, fewer, [scene.component], CAMERA, source, MATCHER)
+        localise(query, fewer, [scene.component], CAMERA, source)

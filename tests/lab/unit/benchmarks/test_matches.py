@@ -10,8 +10,7 @@ from lab.benchmarks.report import Report
 from shared.evaluation.places.evidence import PhotoLocation
 from shared.evaluation.places.levels import LevelScheme
 from shared.matching.features import LocalFeatures
-from shared.matching.matchers import MutualNearest
-from tests.support.local_features import MODEL, scene_features
+from tests.support.local_features import scene_features
 
 PLACES, PER_PLACE = 16, 4
 
@@ -44,7 +43,7 @@ def features() -> list[LocalFeatures]:
 
 
 def test_matches_find_the_places_that_descriptors_confuse_at_a_cost_that_is_reported() -> None:
-    matched = MatchedPhotos(features().__getitem__, MutualNearest.of_model(MODEL))
+    matched = MatchedPhotos(features().__getitem__)
     report = Report("matches")
     compare(report, described(), matched)
     add_cost(report, "house", features(), matched, seconds=0.64)

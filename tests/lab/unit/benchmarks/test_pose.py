@@ -27,7 +27,7 @@ def scene() -> ReconstructedScene:
 
 def test_photos_of_a_scene_are_mapped_aligned_and_judged(scene: ReconstructedScene) -> None:
     features = list(scene.features.values())
-    mapped = MappedPhotos(features, "test@0", np.linspace(0.0, 60.0, PHOTOS))
+    mapped = MappedPhotos(features, np.linspace(0.0, 60.0, PHOTOS))
     (component,) = mapped.components
     assert len(component.photo_ids) == PHOTOS
     truth = 10 * scene.component.centres() + (0.0, 0.0, 3.0)  # metres

@@ -22,7 +22,6 @@ from shared.geodesy import distance_m
 from shared.geometry.component import Component
 from shared.geometry.frames import EastNorthUp, Similarity, align, rotation_of_vector
 from shared.matching.features import LocalFeatures
-from shared.matching.matchers import MutualNearest
 from tests.support.reconstructed_scene import CAMERA, ReconstructedScene, rays_of
 
 COUNT = 10
@@ -53,7 +52,7 @@ def left_out(
         [500 / 640 if n % 2 else None for n in range(COUNT)],
         similarity,
     )
-    found = localise_left_out(photos, MutualNearest(0.9), reports.append, knows_lens=knows_lens)
+    found = localise_left_out(photos, reports.append, knows_lens=knows_lens)
     assert reports == list(range(1, len(found) + 1))
     return found
 

@@ -18,7 +18,6 @@ from services.extractor.geometry.evidence import (
 from services.extractor.geometry.matching import VerifiedMatches, match_pairs
 from services.extractor.geometry.pycolmap_models import PhotoToMap
 from shared.geometry.frames import rotation_of_vector
-from shared.matching.matchers import MutualNearest
 from tests.support.reconstructed_scene import ReconstructedScene, looking
 
 PHOTOS = 12
@@ -35,7 +34,7 @@ def scene() -> ReconstructedScene:
 @pytest.fixture(scope="module")
 def matches(scene: ReconstructedScene) -> VerifiedMatches:
     pairs = np.array([(i, j) for j in range(PHOTOS) for i in range(j)], np.int32)
-    return match_pairs(scene.features, pairs, MutualNearest(0.9), lambda _: None)
+    return match_pairs(scene.features, pairs, lambda _: None)
 
 
 def photos_at(scene: ReconstructedScene, positions: np.ndarray) -> list[PhotoToMap]:

@@ -14,7 +14,6 @@ from services.extractor.geometry.pycolmap_models import PhotoToMap
 from shared.geometry.component import Component
 from shared.geometry.frames import rotation_of_vector
 from shared.matching.features import LocalFeatures
-from shared.matching.matchers import MutualNearest
 from tests.support.reconstructed_scene import CAMERA, DIMENSION, looking
 
 FIRST, SECOND, STEP_M = 16, 10, 2.5
@@ -73,7 +72,7 @@ class AlikeStreets:
             for row, (id_, each) in enumerate(self.features.items())
         ]
         pairs = np.array([(i, j) for j in range(len(photos)) for i in range(j)], np.int32)
-        matches = match_pairs(self.features, pairs, MutualNearest(0.82), lambda _: None)
+        matches = match_pairs(self.features, pairs, lambda _: None)
         found = map_photos(photos, matches, folder, lambda _: None, lambda: None)
         return [each.component for each in found]
 

@@ -19,12 +19,10 @@ from shared.geometry.cameras import Camera, Rays
 from shared.geometry.colmap_model import CAMERA_MODELS
 from shared.geometry.component import NO_POINT, Component
 from shared.geometry.frames import umeyama
-from shared.matching.matchers import MutualNearest
 from tests.support.reconstructed_scene import ReconstructedScene
 
 PHOTOS = 8
 CAMERA = Camera(1280, 960, 1000.0)
-MATCHER = MutualNearest(0.9)
 
 
 def everything(scene: ReconstructedScene) -> tuple[list[PhotoToMap], VerifiedMatches]:
@@ -33,7 +31,7 @@ def everything(scene: ReconstructedScene) -> tuple[list[PhotoToMap], VerifiedMat
         for photo, f in scene.features.items()
     ]
     pairs = np.array([(i, j) for j in range(len(photos)) for i in range(j)], np.int32)
-    return photos, match_pairs(scene.features, pairs, MATCHER, lambda _: None)
+    return photos, match_pairs(scene.features, pairs, lambda _: None)
 
 
 def position_errors(found: Component, scene: ReconstructedScene) -> np.ndarray:

@@ -10,7 +10,6 @@ import pytest
 from services.extractor.geometry import pairs
 from services.extractor.geometry.matching import VerifiedMatches, match_pairs
 from services.extractor.geometry.pairs import choose_pairs
-from shared.matching.matchers import MutualNearest
 from tests.support.reconstructed_scene import ReconstructedScene
 
 COUNT = 60
@@ -84,7 +83,6 @@ def matches() -> VerifiedMatches:
     found = match_pairs(
         {**scene.features, **other.features},
         np.array([[0, 1], [0, 2], [0, 3]], np.int32),
-        MutualNearest(0.9),
         reports.append,
     )
     assert reports == [3]
