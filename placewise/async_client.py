@@ -131,6 +131,7 @@ class AsyncClient(AsyncTransport):
             filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
                 `captured_before`, `place`, `place_under`, `tags`, `tags_like` and `ids`
                 (comma-separated); `certainty` is the share of answers that must be right;
+                `guarantee` instead that of all queries that may get a wrong answer;
                 `elsewhere` the share of queries that are from elsewhere than the map;
                 `history=False` leaves the search out of the search history.
         """

@@ -101,6 +101,13 @@ def query(
             "Default: the map's.",
         ),
     ] = None,
+    guarantee: Annotated[
+        float | None,
+        typer.Option(
+            help="Share of all queries that may get a wrong answer, instead of --certainty. Takes "
+            "labelled queries."
+        ),
+    ] = None,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
@@ -125,6 +132,7 @@ def query(
             tags_like=tags_like,
             certainty=certainty,
             elsewhere=elsewhere,
+            guarantee=guarantee,
         )
         target = describe_target(client, server, map_name)
     if as_json:

@@ -376,7 +376,8 @@ def _estimate(
     query, settings = search.query, search.gateway.settings
     found, whole_map = rankings.found, rankings.whole_map
     model, scheme = _place_model(search)
-    certainty = search_params.certainty or settings.certainty
+    certainty, guarantee = search_params.certainty or settings.certainty, search_params.guarantee
+    model.threshold(certainty, guarantee)  # refuses a guarantee also where nothing is found
     elsewhere = search_params.elsewhere or query.map.elsewhere or ELSEWHERE_SHARE
     neighbours = search.rank_neighbours(whole_map.hits[0].photo_id) if whole_map.hits else ()
     places = model.estimate(
@@ -387,6 +388,7 @@ def _estimate(
         settings.estimate_radius_m,
         matches.add_to(rankings.located.ranking),
         elsewhere,
+        guarantee,
     )
     similar = locate_hits(rankings.similar.hits[: search_params.top_k], rankings.similar.photos)
     if not any(ranked.location.is_known for ranked in similar):

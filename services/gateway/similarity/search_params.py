@@ -185,6 +185,14 @@ class RankingParams(BaseModel):
         description="Share of the answers that must be right: the estimate answers at the finest "
         "level that is certain enough. Default: CERTAINTY.",
     )
+    guarantee: float | None = Field(
+        None,
+        gt=0,
+        lt=1,
+        description="Share of all queries that may get a wrong answer, instead of `certainty`. "
+        "Holds for queries like the map's labelled ones, of which it takes 40 or more "
+        "(1 / guarantee - 1).",
+    )
     history: bool = Field(
         True,
         description="Add the search to the search history. `false` for programs that search with "

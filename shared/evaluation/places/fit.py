@@ -122,6 +122,7 @@ def fit_place_model(
     model = fitted.model_copy(
         update={
             "thresholds": thresholds,
+            "wrong_until": tuple(each.wrong_until for each in labelled_held_out),
             "best_scores": tuple(quantiles.round(4).tolist()),
         }
     )

@@ -15,6 +15,7 @@ whole map says that the query is in it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -25,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
+from shared.errors import Unprocessable
 from shared.evaluation.places.evidence import (
     EVIDENCE_DEPTH,
     PhotoLocation,
@@ -47,7 +49,7 @@ from shared.evaluation.places.levels import (
     ranking_spread,
     vote_weights,
 )
-from shared.evaluation.places.thresholds import CERTAINTIES, have_dropped
+from shared.evaluation.places.thresholds import CERTAINTIES, guaranteed_threshold, have_dropped
 from shared.geodesy import distance_m
 from shared.place_paths import label_levels
 
@@ -239,6 +241,8 @@ class PlaceModel(BaseModel):
     """least probability of an answer, for each of CERTAINTIES"""
     best_scores: tuple[float, ...] = ()
     """quantiles of the score of the best photo, of the queries that the model was fitted on"""
+    wrong_until: tuple[float, ...] = ()
+    """`HeldOutEstimate.wrong_until` of the labelled queries"""
     own_photos: int = 0
     labelled_queries: int = 0
     with_matches: PlaceModel | None = None
@@ -318,10 +322,29 @@ class PlaceModel(BaseModel):
         """Return `PlaceEstimate.in_map` of a query with these levels."""
         return self.is_in_map(self.probabilities(self.extent.end_levels(levels))[1])
 
-    def threshold(self, certainty: float) -> float:
-        """Return how probable a level must be to be the answer."""
-        stored = zip(CERTAINTIES, self.thresholds, strict=False)
-        return next((t for known, t in stored if known >= certainty - 1e-9), certainty)
+    def threshold(self, certainty: float, guarantee: float | None = None) -> float:
+        """Return how probable a level must be to be the answer.
+
+        Args:
+            guarantee: Share of all queries that may get a wrong answer, instead of the certainty.
+
+        Raises:
+            Unprocessable: `too_few_labelled_queries` for the guarantee.
+        """
+        if guarantee is None:
+            stored = zip(CERTAINTIES, self.thresholds, strict=False)
+            return next((t for known, t in stored if known >= certainty - 1e-9), certainty)
+        least = guaranteed_threshold(self.wrong_until, guarantee)
+        if least is None:
+            needed = max(MIN_LABELLED_QUERIES, math.ceil(1 / guarantee - 1 - 1e-9))
+            raise Unprocessable(
+                "too_few_labelled_queries",
+                f"A guarantee of {guarantee:g} takes {needed} labelled queries of another session "
+                f"than the photos that they match, and the last evaluation of the map had "
+                f"{len(self.wrong_until)}. Add photos with role=query, and evaluate the map.",
+                needed=needed,
+            )
+        return least
 
     def is_new(self, recent: Sequence[float]) -> bool:
         """Return whether queries are new to the map, by the scores of their best photos."""
@@ -334,6 +357,7 @@ class PlaceModel(BaseModel):
         probabilities: Sequence[float],
         not_in_map: float,
         certainty: float,
+        guarantee: float | None = None,
     ) -> int | None:
         """Return the index of the finest level that is certain enough; None if none is.
 
@@ -341,7 +365,7 @@ class PlaceModel(BaseModel):
         """
         if not self.is_in_map(not_in_map, certainty):
             return None
-        least = self.threshold(certainty)
+        least = self.threshold(certainty, guarantee)
         enough = (index for index, each in enumerate(probabilities) if each >= least)
         return next(enough, len(probabilities) - 1)
 
@@ -358,6 +382,7 @@ class PlaceModel(BaseModel):
         position_radius_m: float,
         found: Sequence[RankedPhoto] | None = None,
         elsewhere: float = ELSEWHERE_SHARE,
+        guarantee: float | None = None,
     ) -> PlaceEstimate | None:
         """Estimate the place of a query.
 
@@ -368,6 +393,7 @@ class PlaceModel(BaseModel):
             position_radius_m: Photos within this distance of the best one determine the position.
             found: The ranking of a search with a filter; its photos determine the levels.
             elsewhere: Prior probability that the query is from elsewhere.
+            guarantee: As in `threshold`.
 
         Returns:
             The estimate; None if the ranking has no location.
@@ -395,7 +421,7 @@ class PlaceModel(BaseModel):
             location=estimate_location(ordered, position_radius_m),
             levels=levels,
             probabilities=probabilities,
-            answer=model.answer(probabilities, not_in_map, certainty),
+            answer=model.answer(probabilities, not_in_map, certainty, guarantee),
             not_in_map=not_in_map,
             in_map=model.is_in_map(not_in_map, certainty),
             radius_68_m=error_radius_m(levels, probabilities, 0.68),

@@ -4,7 +4,9 @@ The threshold of a certainty c is the lowest probability for which the share c o
 answers, at whichever level, is right, with one more wrong answer counted, as in conformal selection
 (Jin and Candes 2023). Among the answers above a threshold are surer ones, so that it is below c.
 
-That does not hold for queries that differ from those that it was chosen on (`have_dropped`).
+A guarantee takes labelled queries: conformal risk control (Angelopoulos et al. 2022) bounds the
+share of all queries like them that get a wrong answer. Neither holds for queries that differ from
+those that it was chosen on (`have_dropped`).
 """
 
 from __future__ import annotations
@@ -33,6 +35,28 @@ class HeldOutEstimate:
     is_right: Sequence[bool | None]
     left_out: str | None
     weight: float
+
+    @property
+    def wrong_until(self) -> float:
+        """Largest threshold at which the answer to where it is, if any, is wrong."""
+        finer = zip(self.probabilities[:-1], self.is_right, strict=False)
+        return max((probability for probability, right in finer if right is False), default=0.0)
+
+
+def guaranteed_threshold(wrong_until: Sequence[float], error: float) -> float | None:
+    """Return the least threshold at which at most the share `error` of queries is answered wrongly.
+
+    That holds on average over sets of queries like the labelled ones, of which one more is counted
+    as wrong. None if they are too few.
+
+    Args:
+        wrong_until: `HeldOutEstimate.wrong_until` of each labelled query.
+    """
+    allowed = math.floor(error * (len(wrong_until) + 1) + 1e-9) - 1
+    if allowed < 0:
+        return None
+    largest = sorted(wrong_until, reverse=True)[allowed:]
+    return math.nextafter(largest[0], 2.0) if largest else 0.0
 
 
 def have_dropped(recent: Sequence[float], known: Sequence[float], queries: int) -> bool:

@@ -132,6 +132,7 @@ def test_a_query_is_in_the_map_elsewhere_or_neither_is_certain() -> None:
     of_labels=st.booleans(),
     pose_m=st.none() | st.floats(0.1, 3000),
     threshold=st.none() | st.floats(0.75, 1.0),
+    wrong_until=st.none() | st.lists(st.floats(0.0, 1.0), min_size=40, max_size=40),
     is_new=st.booleans(),
 )
 def test_headline_levels_and_fields_of_an_estimate_agree(
@@ -140,10 +141,14 @@ def test_headline_levels_and_fields_of_an_estimate_agree(
     of_labels: bool,
     pose_m: float | None,
     threshold: float | None,
+    wrong_until: list[float] | None,
     is_new: bool,
 ) -> None:
     thresholds = () if threshold is None else (threshold,) * len(CERTAINTIES)
-    model = PlaceModel(source="own_photos", thresholds=thresholds)
+    guarantee = None if wrong_until is None else 0.05
+    model = PlaceModel(
+        source="own_photos", thresholds=thresholds, wrong_until=tuple(wrong_until or ())
+    )
     last = len(probabilities) - 1
     levels = [
         CandidateLevel(
@@ -161,7 +166,7 @@ def test_headline_levels_and_fields_of_an_estimate_agree(
         location=PhotoLocation(None, None, "a") if of_labels else north(0),
         levels=levels,
         probabilities=probabilities,
-        answer=model.answer(probabilities, missing, certainty),
+        answer=model.answer(probabilities, missing, certainty, guarantee),
         not_in_map=missing,
         in_map=model.is_in_map(missing, certainty),
         radius_68_m=error_radius_m(levels, probabilities, 0.68),
@@ -181,7 +186,7 @@ def test_headline_levels_and_fields_of_an_estimate_agree(
         assert ("Photos of elsewhere" in told.reason) is (told.in_map is False)
     if told.answer_level is not None:
         assert told.in_map
-        least = model.threshold(certainty)
+        least = model.threshold(certainty, guarantee)
         is_whole_map = told.levels[told.answer_level].whole_map
         assert stated[told.answer_level] >= min(certainty if is_whole_map else least, 0.95) - 1e-9
         assert all(p < max(least, 0.95) for p in stated[: told.answer_level])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from services.steward.map_evaluation import answers_less
+from shared.errors import Unprocessable
 from shared.evaluation.calibration import expected_calibration_error
 from shared.evaluation.places.evidence import PhotoLocation, RankedPhoto
 from shared.evaluation.places.figures import PlaceEvaluation, evaluate_places
@@ -628,6 +629,21 @@ def test_levels_learn_nothing_from_impostors_which_look_as_weak_as_a_query_at_ni
     own = [sample for sample in own_samples() if sample.left_out is None]
     levels = [fit_place_model(s, [], PATHS, scores).model.levels for s in (own, own_samples())]
     assert levels[0] == levels[1]
+
+
+@pytest.mark.parametrize(("error", "allowed"), [(0.05, 1), (0.1, 3)])
+def test_a_guarantee_counts_one_more_labelled_query_as_wrong(error: float, allowed: int) -> None:
+    wrong_until = [0.9 - n / 100 for n in range(40)]
+    threshold = PlaceModel(wrong_until=tuple(wrong_until)).threshold(0.95, error)
+    assert sum(each >= threshold for each in wrong_until) == allowed
+    assert (allowed + 1) / 41 <= error < (allowed + 2) / 41
+
+
+def test_a_guarantee_without_enough_labelled_queries_says_how_many_it_takes() -> None:
+    with pytest.raises(Unprocessable, match="takes 99 labelled queries") as refused:
+        PlaceModel(wrong_until=(0.0,) * 98).threshold(0.95, 0.01)
+    assert refused.value.code == "too_few_labelled_queries"
+    assert PlaceModel(wrong_until=(0.0,) * 99).threshold(0.95, 0.01) < 1e-9
 
 
 def test_queries_are_new_to_a_map_if_they_are_less_similar_than_those_of_its_calibration() -> None:
