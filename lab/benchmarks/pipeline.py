@@ -5,8 +5,9 @@
 A fleet of one process for each service stores and searches JPEGs of 100 kB, with an extractor and a
 detector of local features that cost nothing. Reported for each descriptor width, with and without
 local features: CPU time of each service, of the extractor's decoders, and of each server, in ms per
-photo. Uploads are then sent in alternating rounds to a gateway and to `bare_upload`, a FastAPI
-server that only stores the file.
+photo. Then the same of an embedded server and its extractor's process, with local features. Uploads
+are then sent in alternating rounds to a gateway and to `bare_upload`, a FastAPI server that only
+stores the file.
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ from __future__ import annotations
 import contextlib
 import functools
 import itertools
+import multiprocessing
 import statistics
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -27,6 +30,7 @@ import torch
 import typer
 from sqlalchemy import select
 
+import placewise
 from lab.benchmarks.load_generator import (
     make_jpegs,
     multipart_forms,
@@ -44,16 +48,18 @@ from shared.matching.features import MAX_KEYPOINTS, WORKING_SIDE
 from shared.matching.xfeat import DIMENSION, XFeatDetector
 from shared.search_api.client import HttpSearchClient
 from tests.support.fleet import Fleet, ServiceProcess, open_fleet, start_servers
+from tests.support.server import environment
 from tests.support.servers.daemon import free_ports
 
 TARGET_OWN_MILLISECONDS, TARGET_DECODER_MILLISECONDS = 1.5, 12.0
+TARGET_EMBEDDED_MILLISECONDS = 1.3 * TARGET_OWN_MILLISECONDS
 TARGET_SHARE_OF_BARE = 0.5
 SIZE, SIZE_BYTES = (1024, 768), 100_000
 TEXTURES = 32
 CLIENTS = 4
 TIMEOUT_SECONDS = 900.0
 EXTRACTOR = "test-slow-avg:milliseconds=0,width={}"
-FREE_EXTRACTOR = "from lab.benchmarks.pipeline import run_free_extractor as run; run()"
+FREE_EXTRACTOR = "from lab.benchmarks.pipeline import run_with_free_extractor as run; run('{}')"
 
 
 def bench(
@@ -72,25 +78,32 @@ def bench(
         start_servers() as servers,
     ):
         cases = list(itertools.product(widths, (Matching.OFF, Matching.ON)))
-        bar = progress.add_task("photos", total=len(cases) + 1)
+        bar = progress.add_task("photos", total=len(cases) + 2)
         for width, matching in cases:
             extractor = EXTRACTOR.format(width)
             with open_fleet(servers, extractor=extractor, batch_photos=batch) as fleet:
-                fleet["extractor-0"].command = [sys.executable, "-c", FREE_EXTRACTOR]
+                fleet["extractor-0"].command = [
+                    sys.executable,
+                    "-c",
+                    FREE_EXTRACTOR.format("extractor"),
+                ]
                 fleet.start()
                 with fleet.catalog.write() as session:
                     session.scalars(select(Map)).one().matching = matching
                 at = f"{width:,} dimensions, local features {matching}"
                 _measure_cpu(report, fleet, jpegs, at, photos, batch)
                 progress.advance(bar)
+        _measure_embedded(report, jpegs, widths[0], photos, batch)
+        progress.advance(bar)
         with open_fleet(servers, extractor=EXTRACTOR.format(widths[0])) as fleet:
             fleet.start("search-0", "gateway-0")
             _measure_uploads(report, fleet, jpegs, photos, rounds)
             progress.advance(bar)
 
 
-def run_free_extractor() -> None:
-    """Run an extractor whose network costs nothing, and whose detector finds the same in all."""
+def run_with_free_extractor(command: str) -> None:
+    """Run `placewise extractor` or `serve` with a network and a detector that cost nothing."""
+    multiprocessing.set_start_method("fork")  # the extractor of `serve` inherits them
     made = functools.cache(lambda width: normalise_features(torch.randn(TEXTURES, width)).numpy())
 
     def describe(extractor: Extractor, photos: Sequence[Any], *_: Any) -> Any:
@@ -105,7 +118,7 @@ def run_free_extractor() -> None:
 
     XFeatDetector.find_keypoints = find_keypoints  # type: ignore[assignment]
     Extractor.describe = describe  # type: ignore[assignment]
-    sys.argv[1:] = ["extractor"]
+    sys.argv[1:] = [command]
     main()
 
 
@@ -142,6 +155,53 @@ def _upload_and_wait(fleet: Fleet, jpegs: Sequence[bytes], photos: int) -> None:
     with HttpSearchClient(fleet.search_urls, timeout_seconds=10) as search:
         while min(search.status().versions.values(), default=0) < map_version:
             time.sleep(0.2)
+
+
+def _measure_embedded(
+    report: Report, jpegs: Sequence[bytes], width: int, photos: int, batch: int
+) -> None:
+    url = f"http://127.0.0.1:{(port := free_ports(1)[0])}"
+    with tempfile.TemporaryDirectory() as folder:
+        settings = environment(
+            Path(folder, "home"),
+            port=port,
+            extractor=EXTRACTOR.format(width),
+            batch_photos=batch,
+            decode_processes=2,
+        )
+        command = [sys.executable, "-c", FREE_EXTRACTOR.format("serve")]
+        server = ServiceProcess("serve", command, settings, Path(folder, "log"), f"{url}/livez")
+        server.start()
+        try:
+            server.wait_until_ready()
+
+            def upload_and_wait(more: int, searchable: int) -> None:
+                upload_all(url, multipart_forms(jpegs, more), CLIENTS)
+                with placewise.connect(url) as client:
+                    while client.stats().searchable_images < searchable:
+                        time.sleep(0.5)
+
+            def cpu_seconds() -> list[float]:
+                (extractor,) = (process := psutil.Process(server.pid)).children()
+                spent = [each.cpu_times() for each in (process, extractor, *extractor.children())]
+                return [times.user + times.system for times in spent]
+
+            upload_and_wait(before := photos + 2 * batch, before)
+            began, started = cpu_seconds(), time.perf_counter()
+            upload_and_wait(photos, before + photos)
+            seconds = time.perf_counter() - started
+            own, extractor, *decoders = (
+                1000 * (after - at) / photos for after, at in zip(cpu_seconds(), began, strict=True)
+            )
+        finally:
+            server.kill()
+    at = f"embedded, {width:,} dimensions"
+    report.add(f"upload to searchable, {at}", photos / seconds, "/s")
+    report.add(f"server's own process, {at}", own, "ms")
+    report.add(
+        f"extractor's own process, {at}", extractor, "ms", at_most=TARGET_EMBEDDED_MILLISECONDS
+    )
+    report.add(f"decoders, {at}", sum(decoders), "ms")
 
 
 def _measure_uploads(
