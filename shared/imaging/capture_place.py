@@ -18,6 +18,7 @@ MAX_ALTITUDE_M = 100_000
 MAX_HEADING = 720  # cameras count on beyond a turn, but not beyond two
 BELOW_ZERO = ("1", "3")  # GPSAltitudeRef: below the sea, below the ellipsoid
 NULL_ISLAND_DEGREES = 1e-6
+OTHER_DATUM = re.compile("TOKYO|GCJ|BD.?09|NAD.?27|ED.?50")  # some 100 m beside WGS 84
 # Numbers with signs and fractions, the marks that programs write between them, and the letter.
 NUMBER = r"[+-]?\d+(?:\.\d*)?(?:/\d+)?"
 MARKS = "[\\s\u00b0\u00ba'\"\u2019\u2032\u201d\u2033]"
@@ -114,6 +115,8 @@ def _coordinates(tags: Mapping[str, Any]) -> tuple[float | None, float | None]:
         raise ValueError(f"of its coordinates it has the {given[0][3:].lower()} only")
     if any(map(math.isnan, angles)):
         raise ValueError("one of its coordinates is no number")
+    if OTHER_DATUM.match(datum := _text(tags.get("GPSMapDatum"))):
+        raise ValueError(f"its coordinates are of the datum {datum[:20]}, not of WGS 84")
     return angles[0], angles[1]
 
 

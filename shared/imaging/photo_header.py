@@ -24,6 +24,7 @@ from shared.imaging.capture_time import read_time
 from shared.imaging.exif import TiffBlock
 from shared.imaging.file_formats import PHOTO_READ_ERRORS, check_pixel_count
 from shared.imaging.file_structure import Metadata, read_structure
+from shared.imaging.takeout import read_takeout
 from shared.imaging.xmp import PLACE_PROPERTIES, read_xmp
 
 MAIN_TAGS = (Base.Orientation, Base.Make, Base.Model, IFD.Exif, IFD.GPSInfo)
@@ -35,7 +36,9 @@ CAMERA_TAGS = (
     *(Base.FocalPlaneXResolution, Base.FocalPlaneResolutionUnit),
     *(Base.ExifImageWidth, Base.ExifImageHeight),
 )
-GPS_TAGS = tuple(GPS[name] for name in (*PLACE_PROPERTIES, "GPSDateStamp", "GPSTimeStamp"))
+GPS_TAGS = tuple(
+    GPS[name] for name in (*PLACE_PROPERTIES, "GPSMapDatum", "GPSDateStamp", "GPSTimeStamp")
+)
 ROTATED_ORIENTATIONS = (5, 6, 7, 8)  # EXIF orientations that swap width and height
 QUARTER_TURNS = {1: 0, 6: 1, 3: 2, 8: 3, **dict.fromkeys((2, 4, 5, 7))}  # clockwise; None: mirrored
 READ_BYTES = 1024 * 1024
@@ -108,7 +111,8 @@ def read_photo_header(
 ) -> PhotoHeader:
     """Read a photo's header from its beginning.
 
-    Coordinates and time are those of the EXIF, or else of the XMP in the file, or of a sidecar.
+    Coordinates and time are those of the EXIF, or else of the XMP in the file, or of a sidecar,
+    which is XMP, or JSON of Google Takeout.
 
     Raises Unprocessable: `undecodable_photo`, `too_many_pixels`.
     """
@@ -130,7 +134,8 @@ def read_photo_header(
     unread = metadata.unread
     for packet in (*metadata.xmp, *sidecars):
         try:
-            sources.append(read_xmp(packet))
+            read = read_takeout if packet[:1] in (b"{", b"[") else read_xmp
+            sources.append(read(packet))
         except ValueError as error:
             unread = str(error)
     time = read_time(sources)
