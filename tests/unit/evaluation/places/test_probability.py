@@ -337,6 +337,22 @@ def test_an_extractor_of_unknown_scores_learns_from_photos_without_their_surroun
     assert np.mean([model.is_in_map(missing) is True for missing in at_home]) > 0.95
 
 
+def test_what_is_less_similar_is_more_probably_elsewhere_whatever_the_own_photos_look_like() -> (
+    None
+):
+    def samples(left_out: str | None, best: float, rival: float) -> list[PlaceSample]:
+        scores = np.random.default_rng(0).normal([best, rival], 0.02, (20, 2)).tolist()
+        return [PlaceSample(n, of_score(*s), [True], left_out) for n, s in enumerate(scores)]
+
+    # The photo that is found without the place lies farther from its rivals.
+    misleading = [*samples(None, 0.4, 0.5), *samples("level 0", 0.4, 0.3)]
+    elsewhere = fit_place_model(misleading, [], PATHS, SCORES).model.elsewhere
+    assert elsewhere is not None
+    by_score = [elsewhere.probability(of_score(score, 0.5), 0.33) for score in (0, 0.2, 0.4, 0.6)]
+    assert by_score == sorted(by_score, reverse=True)
+    assert by_score[0] > 0.33
+
+
 def test_an_own_photo_that_is_alone_at_its_place_is_no_example_of_a_query_in_the_map() -> None:
     alone = list(sampler(8, 1, 0.1).samples(range(8), 0.5))
     together = list(sampler(8, 2, 0.1).samples(range(16), 0.5))
