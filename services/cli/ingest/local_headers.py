@@ -31,14 +31,13 @@ def find_sidecars(photo: Path) -> list[Path]:
 def _takeout_names(photo: Path) -> Iterator[str]:
     """Yield what Google Takeout may have named the JSON of a photo.
 
-    It is `IMG_1.jpg.supplemental-metadata.json` or the beginning of that, such as `IMG_1.jpg.json`;
-    that of `IMG_1(1).jpg` has the number before `.json`.
+    It is `IMG_1.jpg.supplemental-metadata.json`, before 2024 `IMG_1.jpg.json`; that of
+    `IMG_1(1).jpg` has the number before `.json`.
     """
     copy = re.fullmatch(r"(.+)(\(\d+\))", photo.stem)
     for name, number in ((photo.name, ""), *([(copy[1] + photo.suffix, copy[2])] if copy else [])):
-        longest = f"{name}.supplemental-metadata"[:TAKEOUT_NAME_CHARACTERS]
-        for end in range(len(longest), min(len(name), len(longest)) - 1, -1):
-            yield f"{longest[:end]}{number}.json"
+        for kept in (f"{name}.supplemental-metadata", name):
+            yield f"{kept[:TAKEOUT_NAME_CHARACTERS]}{number}.json"
 
 
 def read_sidecar(path: Path) -> bytes:

@@ -175,7 +175,11 @@ LONG = "a" * 43 + ".jpg"  # 47 characters, of which Takeout keeps 46
     [
         ("1.jpg", "1.jpg.json", True),
         ("1.jpg", "1.jpg.supplemental-metadata.json", True),
-        ("1.jpg", "1.jpg.suppl.json", True),
+        (
+            "Screenshot_20230101-123456_Chrome.jpg",
+            "Screenshot_20230101-123456_Chrome.jpg.suppleme.json",
+            True,
+        ),
         ("1(2).jpg", "1.jpg(2).json", True),
         ("1(2).jpg", "1.jpg.supplemental-metadata(2).json", True),
         (LONG, "a" * 43 + ".jp.json", True),
