@@ -46,6 +46,7 @@ from shared.evaluation.places.thresholds import (
     HeldOutEstimate,
     choose_threshold,
 )
+from shared.geodesy import distance_m
 from shared.place_paths import is_within_level, label_levels, look_like_paths
 
 pytestmark = pytest.mark.numerics
@@ -289,6 +290,25 @@ def test_the_last_level_is_the_whole_map_and_adds_up_to_one_with_not_in_this_map
     for share in (0.01, 0.33, 0.9):
         odds = share / (1 - share) * np.exp(1 - 2)
         assert model.probabilities(levels, share)[1] == pytest.approx(odds / (1 + odds))
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        [(-17.0, 179.99), (-17.0, -179.99), (-17.0, 179.9999), (-17.0, -179.9999)],
+        [(89.9, 0.0), (89.9, 180.0), (90.0, 90.0)],
+        [(48.9, 2.3), (-33.9, 151.2), (19.7, -155.1), (-43.5, 172.6)],
+        [(45.0, 7.0), (45.0, 7.0)],
+    ],
+)
+def test_no_two_photos_are_farther_apart_than_the_diameter(
+    points: list[tuple[float, float]],
+) -> None:
+    diameter_m = MapExtent.of([PhotoLocation(*each, None) for each in points], PLAIN).diameter_m
+    farthest_m = max(distance_m(*one, *other) for one in points for other in points)
+    assert diameter_m is not None
+    assert farthest_m <= diameter_m + 1e-6
+    assert diameter_m <= 2 * farthest_m
 
 
 def test_the_whole_map_is_named_by_the_label_that_all_photos_share() -> None:
