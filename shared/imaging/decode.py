@@ -133,7 +133,10 @@ def decode_photo(
 
 def _open_image(data: bytes, media_type: str | None) -> Image.Image:
     if media_type != HEIC_MEDIA_TYPE:
-        return open_photo(io.BytesIO(data))
+        image = open_photo(io.BytesIO(data))
+        for xmp in ("xmp", "XML:com.adobe.xmp"):
+            image.info.pop(xmp, None)  # by which Pillow would turn the photo; browsers do not
+        return image
     try:
         import pillow_heif  # optional: its wheels include libraries under other licences
     except ImportError as error:
