@@ -55,7 +55,8 @@ def read_place(tags: Mapping[str, Any]) -> CapturePlace:
         tags: By the names of EXIF. Of EXIF: numbers, tuples, text, bytes, or None for a broken
             value. Of XMP: text.
     """
-    altitude, heading = _number(tags.get("GPSAltitude")), _number(tags.get("GPSImgDirection"))
+    altitude = finite_number(tags.get("GPSAltitude"))
+    heading = finite_number(tags.get("GPSImgDirection"))
     if altitude is not None and _text(tags.get("GPSAltitudeRef"))[:1] in BELOW_ZERO:
         altitude = -abs(altitude)
     if altitude is not None and abs(altitude) > MAX_ALTITUDE_M:
@@ -160,7 +161,7 @@ def _angle(name: str, value: Any, reference: str, limit: int) -> float:
     return -abs(degrees) if reference[0] == letters[1] else degrees
 
 
-def _number(value: Any) -> float | None:
+def finite_number(value: Any) -> float | None:
     """Return a finite number; also of text such as 4012/10."""
     if isinstance(value, str):
         text = value.strip("\0 ")

@@ -156,11 +156,8 @@ def _put_right(gps: datetime, clock: datetime, offset: timedelta | None) -> date
             if abs(gps + rollovers * ROLLOVER - at) <= timedelta(days=1):
                 gps += rollovers * ROLLOVER
                 moved = (gps + timedelta(days=days) for days in (0, 1, -1))
-                zones = ((time, zone_between(clock, time)) for time in moved)
-                return next(
-                    (time for time, zone in zones if zone is not None and offset in (None, zone)),
-                    gps,
-                )
+                fitting = ZONES if offset is None else [offset]
+                return next((time for time in moved if zone_between(clock, time) in fitting), gps)
     except OverflowError:
         return None if offset is not None else gps
     is_set = offset is not None and clock.year >= GPS_BEGIN

@@ -133,10 +133,7 @@ def decode_photo(
 
 def _open_image(data: bytes, media_type: str | None) -> Image.Image:
     if media_type != HEIC_MEDIA_TYPE:
-        image = open_photo(io.BytesIO(data))
-        for xmp in ("xmp", "XML:com.adobe.xmp"):
-            image.info.pop(xmp, None)  # by which Pillow would turn the photo; browsers do not
-        return image
+        return open_photo(io.BytesIO(data))
     try:
         import pillow_heif  # optional: its wheels include libraries under other licences
     except ImportError as error:
@@ -156,20 +153,21 @@ def apply_exif_orientation(image: Image.Image, rgb: Image.Image) -> Image.Image:
 
     Pillow's `exif_transpose` also rewrites the EXIF, and fails if any other tag is broken.
     """
-    try:
-        orientation = image.getexif().get(Base.Orientation)
-    except PHOTO_READ_ERRORS:
-        return rgb  # broken EXIF does not affect the pixels
-    method = EXIF_TRANSPOSITIONS.get(orientation) if isinstance(orientation, int) else None
+    method = EXIF_TRANSPOSITIONS.get(_exif_orientation(image))
     return rgb if method is None else rgb.transpose(method)
 
 
 def is_sideways(image: Image.Image) -> bool:
     """Whether the EXIF orientation of an image exchanges width and height."""
+    return _exif_orientation(image) in ROTATED_ORIENTATIONS
+
+
+def _exif_orientation(image: Image.Image) -> int | None:
     try:
-        return image.getexif().get(Base.Orientation) in ROTATED_ORIENTATIONS
+        orientation = image.getexif().get(Base.Orientation)
     except PHOTO_READ_ERRORS:
-        return False  # broken EXIF does not affect the pixels
+        return None  # broken EXIF does not affect the pixels
+    return orientation if isinstance(orientation, int) else None
 
 
 def to_rgb(image: Image.Image) -> Image.Image:

@@ -208,9 +208,8 @@ def _fit_elsewhere(samples: Sequence[PlaceSample], scores: MapScores) -> Elsewhe
     """Return the log-odds of photos of elsewhere.
 
     Where the scores of foreign photos are not known, impostors of each kind stand for them: they
-    are more similar to the map, so that too few queries are answered rather than too many. A
-    feature that would speak for elsewhere as it grows counts for nothing: such an accident of some
-    photos would find anything in the map that is less similar to it than all of them.
+    are more similar to the map, so that too few queries are answered rather than too many. What
+    would speak for elsewhere as it grows is left out, or what resembles nothing were in the map.
     """
     prior = shipped_prior()
     if scores.extractor and (known := prior.elsewhere.get(scores.extractor)):

@@ -142,9 +142,9 @@ class MapExtent(BaseModel):
         if points:
             latitudes, longitudes = np.array(points).T
             longitudes = (longitudes - longitudes[0] + 180) % 360  # both sides of the antimeridian
-            middle = ((min(each) + max(each)) / 2 for each in (latitudes, longitudes))
-            away_m = float(distances_m(*middle, latitudes, longitudes).max())
-            diameter_m = min(2 * away_m, math.pi * EARTH_RADIUS_M)
+            north, east = ((each.min() + each.max()) / 2 for each in (latitudes, longitudes))
+            away_m = distances_m(north, east, latitudes, longitudes).max()
+            diameter_m = min(2 * float(away_m), math.pi * EARTH_RADIUS_M)
         return cls(diameter_m=diameter_m, place=shared[0] if shared else None)
 
     def end_levels(self, levels: Sequence[CandidateLevel]) -> list[CandidateLevel]:
