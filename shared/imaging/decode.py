@@ -162,12 +162,12 @@ def is_sideways(image: Image.Image) -> bool:
     return _exif_orientation(image) in ROTATED_ORIENTATIONS
 
 
-def _exif_orientation(image: Image.Image) -> int | None:
+def _exif_orientation(image: Image.Image) -> int:
     try:
         orientation = image.getexif().get(Base.Orientation)
     except PHOTO_READ_ERRORS:
-        return None  # broken EXIF does not affect the pixels
-    return orientation if isinstance(orientation, int) else None
+        return 1  # broken EXIF does not affect the pixels
+    return orientation if isinstance(orientation, int) else 1
 
 
 def to_rgb(image: Image.Image) -> Image.Image:
