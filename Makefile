@@ -41,7 +41,7 @@ $(INSTALLED): $(RUNNABLE)
 	@touch $(INSTALLED)
 
 run: $(RUNNABLE) ## serve the embedded Placewise on http://HOST:PORT, data under PLACEWISE_HOME
-	HOST=$(HOST) PORT=$(PORT) PLACEWISE_HOME=$(PLACEWISE_HOME) exec $(BIN)/placewise serve
+	HOST=$(HOST) PORT=$(PORT) PLACEWISE_HOME='$(PLACEWISE_HOME)' exec $(BIN)/placewise serve
 
 test: $(INSTALLED) ## all tests (PLACEWISE_TEST_DATA=FOLDER adds those on real photos)
 	$(BIN)/python -m pytest tests --numprocesses auto --dist loadfile --no-loadscope-reorder

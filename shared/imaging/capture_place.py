@@ -18,6 +18,7 @@ MAX_ALTITUDE_M = 100_000
 MAX_HEADING = 720  # cameras count on beyond a turn, but not beyond two
 BELOW_ZERO = ("1", "3")  # GPSAltitudeRef: below the sea, below the ellipsoid
 NULL_ISLAND_DEGREES = 1e-6
+OTHER_DATUM = re.compile("TOKYO|GCJ|BD.?09|NAD.?27|ED.?50")  # some 100 m beside WGS 84
 # Numbers with signs and fractions, the marks that programs write between them, and the letter.
 NUMBER = r"[+-]?\d+(?:\.\d*)?(?:/\d+)?"
 MARKS = "[\\s\u00b0\u00ba'\"\u2019\u2032\u201d\u2033]"
@@ -54,7 +55,8 @@ def read_place(tags: Mapping[str, Any]) -> CapturePlace:
         tags: By the names of EXIF. Of EXIF: numbers, tuples, text, bytes, or None for a broken
             value. Of XMP: text.
     """
-    altitude, heading = _number(tags.get("GPSAltitude")), _number(tags.get("GPSImgDirection"))
+    altitude = finite_number(tags.get("GPSAltitude"))
+    heading = finite_number(tags.get("GPSImgDirection"))
     if altitude is not None and _text(tags.get("GPSAltitudeRef"))[:1] in BELOW_ZERO:
         altitude = -abs(altitude)
     if altitude is not None and abs(altitude) > MAX_ALTITUDE_M:
@@ -114,6 +116,8 @@ def _coordinates(tags: Mapping[str, Any]) -> tuple[float | None, float | None]:
         raise ValueError(f"of its coordinates it has the {given[0][3:].lower()} only")
     if any(map(math.isnan, angles)):
         raise ValueError("one of its coordinates is no number")
+    if OTHER_DATUM.match(datum := _text(tags.get("GPSMapDatum"))):
+        raise ValueError(f"its coordinates are of the datum {datum[:20]}, not of WGS 84")
     return angles[0], angles[1]
 
 
@@ -157,7 +161,7 @@ def _angle(name: str, value: Any, reference: str, limit: int) -> float:
     return -abs(degrees) if reference[0] == letters[1] else degrees
 
 
-def _number(value: Any) -> float | None:
+def finite_number(value: Any) -> float | None:
     """Return a finite number; also of text such as 4012/10."""
     if isinstance(value, str):
         text = value.strip("\0 ")

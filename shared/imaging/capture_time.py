@@ -146,12 +146,18 @@ def _gps_time(tags: Mapping[str, Any]) -> datetime | None:
 
 
 def _put_right(gps: datetime, clock: datetime, offset: timedelta | None) -> datetime | None:
-    """Return the GPS time with the right week; None if it contradicts the clock."""
+    """Return the GPS time with the right week and day; None if it contradicts the clock.
+
+    Some phones write the day of their clock, which is not that of UTC, beside the time of UTC.
+    """
     try:
         at = clock - (offset or timedelta())
         for rollovers in (0, 1, 2, -1):
             if abs(gps + rollovers * ROLLOVER - at) <= timedelta(days=1):
-                return gps + rollovers * ROLLOVER
+                gps += rollovers * ROLLOVER
+                moved = (gps + timedelta(days=days) for days in (0, 1, -1))
+                fitting = ZONES if offset is None else [offset]
+                return next((time for time in moved if zone_between(clock, time) in fitting), gps)
     except OverflowError:
         return None if offset is not None else gps
     is_set = offset is not None and clock.year >= GPS_BEGIN

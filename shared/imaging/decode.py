@@ -153,20 +153,21 @@ def apply_exif_orientation(image: Image.Image, rgb: Image.Image) -> Image.Image:
 
     Pillow's `exif_transpose` also rewrites the EXIF, and fails if any other tag is broken.
     """
-    try:
-        orientation = image.getexif().get(Base.Orientation)
-    except PHOTO_READ_ERRORS:
-        return rgb  # broken EXIF does not affect the pixels
-    method = EXIF_TRANSPOSITIONS.get(orientation) if isinstance(orientation, int) else None
+    method = EXIF_TRANSPOSITIONS.get(_exif_orientation(image))
     return rgb if method is None else rgb.transpose(method)
 
 
 def is_sideways(image: Image.Image) -> bool:
     """Whether the EXIF orientation of an image exchanges width and height."""
+    return _exif_orientation(image) in ROTATED_ORIENTATIONS
+
+
+def _exif_orientation(image: Image.Image) -> int:
     try:
-        return image.getexif().get(Base.Orientation) in ROTATED_ORIENTATIONS
+        orientation = image.getexif().get(Base.Orientation)
     except PHOTO_READ_ERRORS:
-        return False  # broken EXIF does not affect the pixels
+        return 1  # broken EXIF does not affect the pixels
+    return orientation if isinstance(orientation, int) else 1
 
 
 def to_rgb(image: Image.Image) -> Image.Image:

@@ -127,7 +127,10 @@ def open_photo(file: BinaryIO) -> Image.Image:
     """
     read_structure(file)
     file.seek(0)
-    return Image.open(file, formats=PILLOW_FORMATS)
+    image = Image.open(file, formats=PILLOW_FORMATS)
+    for xmp in ("xmp", "XML:com.adobe.xmp"):
+        image.info.pop(xmp, None)  # by which Pillow would turn the photo; browsers do not
+    return image
 
 
 def _read_jpeg(reader: BoundedReader) -> PhotoStructure:

@@ -8,7 +8,6 @@ is bounded whatever the file says (`shared.imaging.bounded_reader`).
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
@@ -19,11 +18,12 @@ from PIL.ExifTags import GPS, IFD, Base
 
 from shared.errors import Unprocessable
 from shared.geometry.cameras import focal_length_from_exif
-from shared.imaging.capture_place import CapturePlace, read_place, true_heading
+from shared.imaging.capture_place import CapturePlace, finite_number, read_place, true_heading
 from shared.imaging.capture_time import read_time
 from shared.imaging.exif import TiffBlock
 from shared.imaging.file_formats import PHOTO_READ_ERRORS, check_pixel_count
 from shared.imaging.file_structure import Metadata, read_structure
+from shared.imaging.takeout import read_takeout
 from shared.imaging.xmp import PLACE_PROPERTIES, read_xmp
 
 MAIN_TAGS = (Base.Orientation, Base.Make, Base.Model, IFD.Exif, IFD.GPSInfo)
@@ -35,7 +35,7 @@ CAMERA_TAGS = (
     *(Base.FocalPlaneXResolution, Base.FocalPlaneResolutionUnit),
     *(Base.ExifImageWidth, Base.ExifImageHeight),
 )
-GPS_TAGS = tuple(GPS[name] for name in (*PLACE_PROPERTIES, "GPSDateStamp", "GPSTimeStamp"))
+GPS_TAGS = tuple(GPS[n] for n in (*PLACE_PROPERTIES, "GPSMapDatum", "GPSDateStamp", "GPSTimeStamp"))
 ROTATED_ORIENTATIONS = (5, 6, 7, 8)  # EXIF orientations that swap width and height
 QUARTER_TURNS = {1: 0, 6: 1, 3: 2, 8: 3, **dict.fromkeys((2, 4, 5, 7))}  # clockwise; None: mirrored
 READ_BYTES = 1024 * 1024
@@ -108,7 +108,8 @@ def read_photo_header(
 ) -> PhotoHeader:
     """Read a photo's header from its beginning.
 
-    Coordinates and time are those of the EXIF, or else of the XMP in the file, or of a sidecar.
+    Coordinates and time are those of the EXIF, or else of the XMP in the file, or of a sidecar,
+    which is XMP, or JSON of Google Takeout.
 
     Raises Unprocessable: `undecodable_photo`, `too_many_pixels`.
     """
@@ -118,8 +119,7 @@ def read_photo_header(
         raise Unprocessable("undecodable_photo", f"The photo can't be decoded: {error}.") from error
     width, height, metadata = structure.width, structure.height, structure.metadata
     check_pixel_count(width, height, max_pixels)
-    reader = _ExifReader(metadata)
-    main, details, gps = reader.read()
+    main, details, gps = _ExifReader(metadata).read()
     orientation = 1 if structure.is_upright else main.get(Base.Orientation) or 1
     if orientation in ROTATED_ORIENTATIONS:
         width, height = height, width
@@ -130,7 +130,8 @@ def read_photo_header(
     unread = metadata.unread
     for packet in (*metadata.xmp, *sidecars):
         try:
-            sources.append(read_xmp(packet))
+            read = read_takeout if packet[:1] in (b"{", b"[") else read_xmp
+            sources.append(read(packet))
         except ValueError as error:
             unread = str(error)
     time = read_time(sources)
@@ -193,14 +194,6 @@ class _ExifReader:
             return {}
 
 
-def _number(value: Any) -> float | None:
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if math.isfinite(number) else None
-
-
 def _focal_length(details: dict[int, Any], width: int, height: int) -> float | None:
     # The resolution is that of the photo as it was taken: this file may be a smaller copy.
     taken = details.get(Base.ExifImageWidth), details.get(Base.ExifImageHeight)
@@ -209,9 +202,9 @@ def _focal_length(details: dict[int, Any], width: int, height: int) -> float | N
     return focal_length_from_exif(
         width,
         height,
-        _number(details.get(Base.FocalLengthIn35mmFilm)),
-        _number(details.get(Base.FocalLength)),
-        _number(details.get(Base.FocalPlaneXResolution)),
+        finite_number(details.get(Base.FocalLengthIn35mmFilm)),
+        finite_number(details.get(Base.FocalLength)),
+        finite_number(details.get(Base.FocalPlaneXResolution)),
         details.get(Base.FocalPlaneResolutionUnit, EXIF_INCH),
     )
 

@@ -40,6 +40,7 @@ def test_make_run_installs_nothing_after_make_test_or_itself(checkout: Path) -> 
     assert "--all-extras" in make(checkout, "test")
     (checkout / ".venv" / ".installed").touch()
     assert "pip install" not in make(checkout, "run", "test")
+    assert "PLACEWISE_HOME='/a b' exec" in make(checkout, "run", "PLACEWISE_HOME=/a b")
 
 
 def test_a_build_of_pytorch_is_installed_first_and_kept_by_later_targets(checkout: Path) -> None:

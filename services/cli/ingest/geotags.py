@@ -54,7 +54,7 @@ class LocalPhoto:
     relative_path: str | None = None
     """Path in the folder that is indexed."""
     sidecars: Mapping[str, bytes] = field(default_factory=dict)
-    """XMP by path"""
+    """XMP, and JSON of Google Takeout, by path"""
 
     def content(self) -> Path | BinaryIO:
         """Return the file, or what was fetched of a photo that is none. Raises PlacewiseError."""

@@ -108,7 +108,7 @@ def index(
     """Upload photos and wait until they are searchable.
 
     Coordinates are read from the CSV table or manifest, from @UTM@ file names, from EXIF or XMP in
-    the photo, or from its sidecar (IMG_1.jpg.xmp, IMG_1.xmp). An
+    the photo, or from its sidecar (IMG_1.jpg.xmp, IMG_1.xmp, or the JSON of Google Takeout). An
     archive may contain its own table: photos.csv or manifest.jsonl. The command is idempotent: run
     it again after an interruption.
     """
@@ -176,14 +176,14 @@ def index(
                 )
         if photos and anyloc is None:
             photos, headers = add_local_headers(photos, time_zone)
-            sidecars = len({path for photo in photos for path in photo.sidecars})
+            sidecars = {path for photo in photos for path in photo.sidecars}
             read = Counter(each.table.suffix for each in opened if each.table)
-            read[".xmp"] = sidecars
+            read.update(Path(path).suffix.lower() for path in sidecars)
             others = sum((count_other_files(each.path) for each in opened), Counter[str]()) - read
             about_sources = {
                 "other_files": others.total(),
                 "other_suffixes": dict(others.most_common()),
-                "sidecars": sidecars,
+                "sidecars": len(sidecars),
                 **asdict(headers),
             }
         client = stack.enter_context(connect(server, map_name, key))
@@ -244,7 +244,7 @@ def _print_report(report: Json, server: str | None, map_name: str | None, role: 
             f"{_count(report['without_coordinates'], 'photo')} without coordinates."
         )
     if report.get("sidecars"):
-        print_note(f"{_count(report['sidecars'], 'sidecar')} (XMP) read.")
+        print_note(f"{_count(report['sidecars'], 'sidecar')} read.")
     if report.get("without_time_zone"):
         print_note(
             f"{_count(report['without_time_zone'], 'photo')} with a time but no time zone: the "

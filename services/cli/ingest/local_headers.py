@@ -1,11 +1,12 @@
-"""Headers of photos on this machine, with their XMP sidecars and time zones."""
+"""Headers of photos on this machine, with their sidecars and time zones."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timezone, tzinfo
 from pathlib import Path
@@ -17,15 +18,26 @@ from shared.geotagging.evidence import Dated, DatedPhoto
 from shared.imaging.bounded_reader import MAX_METADATA_BYTES
 from shared.imaging.photo_header import PhotoHeader, read_photo_header
 
+TAKEOUT_NAME_CHARACTERS = 46  # to which Google Takeout cuts the name of a JSON off
+
 
 def find_sidecars(photo: Path) -> list[Path]:
-    """Return the sidecars of a photo that exist: `IMG_1.jpg.xmp`, then `IMG_1.xmp`."""
-    paths = (
-        photo.with_name(name + suffix)
-        for name in (photo.name, photo.stem)
-        for suffix in (".xmp", ".XMP")
-    )
+    """Return the sidecars of a photo that exist: `IMG_1.jpg.xmp`, `IMG_1.xmp`, then JSON."""
+    xmp = (name + suffix for name in (photo.name, photo.stem) for suffix in (".xmp", ".XMP"))
+    paths = map(photo.with_name, (*xmp, *_takeout_names(photo)))
     return [path for path in paths if os.path.isfile(path)]  # noqa: PTH113 any length
+
+
+def _takeout_names(photo: Path) -> Iterator[str]:
+    """Yield what Google Takeout may have named the JSON of a photo.
+
+    It is `IMG_1.jpg.supplemental-metadata.json`, before 2024 `IMG_1.jpg.json`; that of
+    `IMG_1(1).jpg` has the number before `.json`.
+    """
+    copy = re.fullmatch(r"(.+)(\(\d+\))", photo.stem)
+    for name, number in ((photo.name, ""), *([(copy[1] + photo.suffix, copy[2])] if copy else [])):
+        for kept in (f"{name}.supplemental-metadata", name):
+            yield f"{kept[:TAKEOUT_NAME_CHARACTERS]}{number}.json"
 
 
 def read_sidecar(path: Path) -> bytes:

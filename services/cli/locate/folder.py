@@ -117,7 +117,8 @@ class FolderLibrary:
 
     def _write_sidecar(self, photo: Path, proposal: Proposal) -> Path:
         """Add the position to the sidecar of a photo, or to a new one; return its path."""
-        path = next(iter(find_sidecars(photo)), sidecar_path(photo))
+        xmp = (path for path in find_sidecars(photo) if path.suffix.lower() == ".xmp")
+        path = next(xmp, sidecar_path(photo))
         with refuse_unwritable(path):
             existing = path.read_bytes() if path.is_file() else None
             at = proposal.latitude, proposal.longitude

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -208,7 +208,8 @@ def _fit_elsewhere(samples: Sequence[PlaceSample], scores: MapScores) -> Elsewhe
     """Return the log-odds of photos of elsewhere.
 
     Where the scores of foreign photos are not known, impostors of each kind stand for them: they
-    are more similar to the map, so that too few queries are answered rather than too many.
+    are more similar to the map, so that too few queries are answered rather than too many. What
+    would speak for elsewhere as it grows is left out, or what resembles nothing were in the map.
     """
     prior = shipped_prior()
     if scores.extractor and (known := prior.elsewhere.get(scores.extractor)):
@@ -219,8 +220,14 @@ def _fit_elsewhere(samples: Sequence[PlaceSample], scores: MapScores) -> Elsewhe
         return other
     plain = PlacePrior(means=(), scales=(), level=(), missing_place=())
     name = "coefficients" if table.features.shape[1] == 2 else "matched"
-    fitted = fit_map_estimate(table, getattr(other, name), plain, ELSEWHERE_PRECISION)
-    return other.model_copy(update={name: fitted})
+    used = np.ones(1 + table.features.shape[1])
+    while True:
+        counted = replace(table, features=table.features * used[1:])
+        center = tuple((np.array(getattr(other, name)) * used).tolist())
+        fitted = fit_map_estimate(counted, center, plain, ELSEWHERE_PRECISION)
+        if max(fitted[1:]) <= 0:
+            return other.model_copy(update={name: fitted})
+        used[1:][np.array(fitted[1:]) > 0] = 0
 
 
 def sample_weights(samples: Sequence[PlaceSample], share: float) -> list[float]:

@@ -50,7 +50,7 @@ from shared.evaluation.places.levels import (
     vote_weights,
 )
 from shared.evaluation.places.thresholds import CERTAINTIES, guaranteed_threshold, have_dropped
-from shared.geodesy import distance_m
+from shared.geodesy import EARTH_RADIUS_M, distances_m
 from shared.place_paths import label_levels
 
 CalibrationSource = Literal["prior", "own_photos", "labelled_queries"]
@@ -140,9 +140,11 @@ class MapExtent(BaseModel):
         ]
         diameter_m = None
         if points:
-            south, west = np.min(points, axis=0).tolist()
-            north, east = np.max(points, axis=0).tolist()
-            diameter_m = distance_m(south, west, north, east)
+            latitudes, longitudes = np.array(points).T
+            longitudes = (longitudes - longitudes[0] + 180) % 360  # both sides of the antimeridian
+            north, east = ((each.min() + each.max()) / 2 for each in (latitudes, longitudes))
+            away_m = distances_m(north, east, latitudes, longitudes).max()
+            diameter_m = min(2 * float(away_m), math.pi * EARTH_RADIUS_M)
         return cls(diameter_m=diameter_m, place=shared[0] if shared else None)
 
     def end_levels(self, levels: Sequence[CandidateLevel]) -> list[CandidateLevel]:

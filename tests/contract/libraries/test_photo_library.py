@@ -23,6 +23,7 @@ from shared.imaging.xmp import EXIF, RDF
 from tests.support.immich_server import KEY, NOON, ImmichServer, running_immich
 from tests.support.photos import encoded, exif_with_position, photo_bytes, photo_image
 
+TAKEOUT = '{"geoData": {"latitude": 0.0, "longitude": 0.0, "altitude": 0.0}}'
 HERE, THERE = (45.0691, 7.6853), (45.08, 7.69)
 
 
@@ -57,6 +58,8 @@ class FolderCase(Case):
         exif.get_ifd(IFD.Exif)[Base.OffsetTimeOriginal] = "+02:00"
         data = encoded(photo_image(number), "JPEG", exif=exif)
         (self.folder / f"IMG_{number}.jpg").write_bytes(data)
+        # As Google Takeout writes it for a photo without a place; nothing is to be written into it.
+        (self.folder / f"IMG_{number}.jpg.json").write_text(TAKEOUT, encoding="utf-8")
         return f"IMG_{number}.jpg"
 
     def place(self, name: str, position: tuple[float, float]) -> None:

@@ -167,6 +167,55 @@ def test_sidecars_and_the_zone_of_the_camera_add_what_the_photos_lack(tmp_path: 
     assert photos[0].fields["captured_at"] == "2026-05-01T07:00:00+00:00"
 
 
+SCREENSHOT = "Screenshot_20230101-123456_Chrome.jpg"
+LONG = "a" * 43 + ".jpg"  # 47 characters, of which Takeout keeps 46
+
+
+@pytest.mark.parametrize(
+    ("photo", "sidecar", "is_its_own"),
+    [
+        ("1.jpg", "1.jpg.json", True),
+        ("1.jpg", "1.jpg.supplemental-metadata.json", True),
+        (SCREENSHOT, f"{SCREENSHOT}.suppleme.json", True),
+        ("1(2).jpg", "1.jpg(2).json", True),
+        ("1(2).jpg", "1.jpg.supplemental-metadata(2).json", True),
+        (LONG, "a" * 43 + ".jp.json", True),
+        ("1.jpg", "1.jpg(2).json", False),
+        ("1(2).jpg", "1.jpg.json", False),
+        ("1.jpg", "1.json", False),
+    ],
+)
+def test_the_json_of_google_takeout_is_a_sidecar_under_all_its_names(
+    photo: str, sidecar: str, is_its_own: bool, tmp_path: Path
+) -> None:
+    (tmp_path / photo).write_bytes(photo_bytes(1))
+    (tmp_path / sidecar).write_text(
+        '{"title": "1.jpg", "photoTakenTime": {"timestamp": "1714557600"}, "geoData": '
+        '{"latitude": -33.85, "longitude": 151.2, "altitude": 0.0, "latitudeSpan": 0.0}}'
+    )
+    [found], report = add_local_headers(find_photos(tmp_path, None, None), None)
+    expected = ["-33.85", "151.2", "2024-05-01T10:00:00+00:00"] if is_its_own else []
+    assert [*found.fields.values()] == expected
+    assert report.without_coordinates != is_its_own
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ('{"geoData": {"latitude": 0.0, "longitude": 0.0, "altitude": 0.0}}', None),
+        ('{"geoData": {"latitude": "x"}, "photoTakenTime": {"timestamp": "9e99"}}', None),
+        ('[{"SourceFile": "1.jpg"}]', None),
+        ('{"geoData": {"latitude": 1', "its JSON is damaged"),
+    ],
+)
+def test_json_without_a_place_adds_nothing(text: str, reason: str | None, tmp_path: Path) -> None:
+    (tmp_path / "1.jpg").write_bytes(photo_bytes(1))
+    (tmp_path / "1.jpg.json").write_text(text)
+    [found], report = add_local_headers(find_photos(tmp_path, None, None), None)
+    assert found.fields == {}
+    assert [each["reason"] for each in report.not_understood] == ([reason] if reason else [])
+
+
 def test_a_list_that_names_a_missing_photo_is_refused_by_its_line(tmp_path: Path) -> None:
     (tmp_path / "1.jpg").write_bytes(b"one")
     data = b'{"filename": "1.jpg"}\n{"filename": "2.jpg"}\n'

@@ -120,6 +120,24 @@ def test_a_gps_date_that_contradicts_the_camera_clock_is_ignored(
     assert taken(of_gps | of_clock) == expected
 
 
+@pytest.mark.parametrize(
+    ("of_clock", "hours", "expected"),
+    [
+        (clock("2023:05:02 00:30:00", "+02:00"), 22, "2023-05-01T22:30:00"),
+        (clock("2023:05:02 00:30:00"), 22, "2023-05-01T22:30:00"),
+        (clock("2023:05:02 20:30:00", "-07:00"), 3, "2023-05-03T03:30:00"),
+        (clock("2023:05:02 20:30:00"), 3, "2023-05-03T03:30:00"),
+        (clock("2023:05:02 00:30:00", "+13:00"), 11, "2023-05-01T11:30:00"),  # not -11:00
+        (clock("2023:05:02 23:30:00", "+00:00"), 23, "2023-05-02T23:30:00"),
+        (clock("2023:05:02 20:30:00", "-01:00"), 3, "2023-05-02T03:30:00"),  # another zone's
+    ],
+)
+def test_the_day_of_a_gps_time_is_put_right_where_it_is_that_of_the_clock(
+    of_clock: dict[str, Any], hours: int, expected: str
+) -> None:
+    assert taken(gps("2023:05:02", hours, 30, 0) | of_clock) == expected
+
+
 def test_the_zone_of_a_clock_follows_from_the_gps_time() -> None:
     found = read_time([gps("2024:05:01", 4, 29, 58) | clock("2024:05:01 10:00:01")])
     assert found.clock_offset == timedelta(hours=5, minutes=30)

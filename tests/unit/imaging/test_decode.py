@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
+from PIL.PngImagePlugin import PngInfo
 
 from shared.errors import Unprocessable
 from shared.imaging.decode import FULL_DECODE_PIXELS, THUMBNAIL_PIXELS, decode_photo
@@ -92,6 +93,17 @@ def test_every_exif_orientation_comes_out_upright(orientation: int, media: str) 
     thumbnail = Image.open(io.BytesIO(decoded.thumbnail))
     assert thumbnail.size == (48, 32)
     assert corners(np.asarray(thumbnail)) == ["red", "green", "blue", "yellow"]
+
+
+@pytest.mark.parametrize("media", ["JPEG", "WEBP", "PNG", "TIFF"])
+def test_an_orientation_in_xmp_turns_no_photo_as_in_browsers(media: str) -> None:
+    xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/" tiff:Orientation="6"/>'
+    text = PngInfo()
+    text.add_itxt("XML:com.adobe.xmp", xmp.decode())
+    by_media: dict[str, Any] = {"PNG": {"pnginfo": text}, "TIFF": {"tiffinfo": {700: xmp}}}
+    data = encoded(Image.new("RGB", (48, 32)), media, **by_media.get(media, {"xmp": xmp}))
+    decoded = decode_photo(data, SQUARE, PIXELS)
+    assert decoded.size == Image.open(io.BytesIO(decoded.thumbnail)).size == (48, 32)
 
 
 @pytest.mark.parametrize("name", ["demo1024", "paper480x640", "round14"])

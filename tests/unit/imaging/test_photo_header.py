@@ -103,6 +103,7 @@ def reason(data: bytes, max_pixels: int = PIXELS) -> Unprocessable:
         {GPS.GPSLongitudeRef: ""},
         {GPS.GPSLatitudeRef: "E"},
         {GPS.GPSLongitudeRef: None, GPS.GPSLongitude: None},
+        {GPS.GPSMapDatum: "Tokyo "},
     ],
 )
 def test_incomplete_or_out_of_range_gps_positions_are_ignored(broken: Tags) -> None:

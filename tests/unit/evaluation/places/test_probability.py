@@ -46,6 +46,7 @@ from shared.evaluation.places.thresholds import (
     HeldOutEstimate,
     choose_threshold,
 )
+from shared.geodesy import distance_m
 from shared.place_paths import is_within_level, label_levels, look_like_paths
 
 pytestmark = pytest.mark.numerics
@@ -291,6 +292,25 @@ def test_the_last_level_is_the_whole_map_and_adds_up_to_one_with_not_in_this_map
         assert model.probabilities(levels, share)[1] == pytest.approx(odds / (1 + odds))
 
 
+@pytest.mark.parametrize(
+    "points",
+    [
+        [(-17.0, 179.99), (-17.0, -179.99), (-17.0, 179.9999), (-17.0, -179.9999)],
+        [(89.9, 0.0), (89.9, 180.0), (90.0, 90.0)],
+        [(48.9, 2.3), (-33.9, 151.2), (19.7, -155.1), (-43.5, 172.6)],
+        [(45.0, 7.0), (45.0, 7.0)],
+    ],
+)
+def test_no_two_photos_are_farther_apart_than_the_diameter(
+    points: list[tuple[float, float]],
+) -> None:
+    diameter_m = MapExtent.of([PhotoLocation(*each, None) for each in points], PLAIN).diameter_m
+    farthest_m = max(distance_m(*one, *other) for one in points for other in points)
+    assert diameter_m is not None
+    assert farthest_m <= diameter_m + 1e-6
+    assert diameter_m <= 2 * farthest_m
+
+
 def test_the_whole_map_is_named_by_the_label_that_all_photos_share() -> None:
     floors = [label("tower/1/hall"), label("tower/2/hall")]
     levels = [CandidateLevel(place=p, is_path=True) for p in ("tower/1/hall", "tower/1", "tower")]
@@ -335,6 +355,22 @@ def test_an_extractor_of_unknown_scores_learns_from_photos_without_their_surroun
     assert np.mean([bool(model.accepts(s.levels)) for s in own]) > 0.5
     at_home = [model.probabilities(model.extent.end_levels(s.levels), 0.05)[1] for s in own]
     assert np.mean([model.is_in_map(missing) is True for missing in at_home]) > 0.95
+
+
+def test_what_is_less_similar_is_more_probably_elsewhere_whatever_the_own_photos_look_like() -> (
+    None
+):
+    def samples(left_out: str | None, best: float, rival: float) -> list[PlaceSample]:
+        scores = np.random.default_rng(0).normal([best, rival], 0.02, (20, 2)).tolist()
+        return [PlaceSample(n, of_score(*s), [True], left_out) for n, s in enumerate(scores)]
+
+    # The photo that is found without the place lies farther from its rivals.
+    misleading = [*samples(None, 0.4, 0.5), *samples("level 0", 0.4, 0.3)]
+    elsewhere = fit_place_model(misleading, [], PATHS, SCORES).model.elsewhere
+    assert elsewhere is not None
+    by_score = [elsewhere.probability(of_score(score, 0.5), 0.33) for score in (0, 0.2, 0.4, 0.6)]
+    assert by_score == sorted(by_score, reverse=True)
+    assert by_score[0] > 0.33
 
 
 def test_an_own_photo_that_is_alone_at_its_place_is_no_example_of_a_query_in_the_map() -> None:
