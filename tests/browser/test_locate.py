@@ -7,12 +7,11 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from PIL import Image
-from PIL.ExifTags import GPS, IFD, Base
 from playwright.sync_api import expect
 
 from shared.ingest.photo_metadata import read_csv_manifest
 from tests.browser.conftest import CityServer, Visitor
-from tests.support.photos import photo_bytes
+from tests.support.photos import camera_exif, photo_bytes
 
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
 
@@ -21,16 +20,7 @@ def take_photo(
     picture: Path, path: Path, seconds: float, position: tuple[float, float] | None
 ) -> None:
     """Copy a picture as one of a camera, so many seconds after noon."""
-    exif = Image.Exif()
-    exif[Base.Model] = "Camera"
-    exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = (
-        f"{NOON + timedelta(seconds=seconds):%Y:%m:%d %H:%M:%S}"
-    )
-    if position:
-        gps = exif.get_ifd(IFD.GPSInfo)
-        gps[GPS.GPSLatitudeRef], gps[GPS.GPSLongitudeRef] = "N", "E"
-        gps[GPS.GPSLatitude] = (position[0], 0.0, 0.0)
-        gps[GPS.GPSLongitude] = (position[1], 0.0, 0.0)
+    exif = camera_exif(NOON + timedelta(seconds=seconds), position, model="Camera")
     with Image.open(picture) as image:
         image.save(path, "JPEG", exif=exif)
 

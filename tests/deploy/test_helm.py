@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import kubernetes_validate
@@ -30,7 +29,6 @@ from tests.deploy.helm_chart import (
     run_helm,
 )
 from tests.support.catalog_rows import add_map
-from tests.support.servers import PostgresServer
 
 EACH = pytest.mark.parametrize("name", EXAMPLES)
 # Of KEDA, the Prometheus Operator and the External Secrets Operator: no schemas are at hand.
@@ -468,15 +466,9 @@ def test_only_prometheus_reaches_the_port_of_the_metrics() -> None:
     assert set(chosen["values"]) == {"gateway", "extractor", "search", "steward"}
 
 
-@pytest.fixture
-def on_postgres(postgres: PostgresServer, migrated_postgres: str) -> Iterator[Catalog]:
-    opened = Catalog(postgres.new_database(migrated_postgres))
-    yield opened
-    opened.close()
-
-
+@pytest.mark.databases("postgresql")
 def test_extractors_are_scaled_by_the_jobs_that_wait_for_them_or_are_under_way(
-    on_postgres: Catalog,
+    catalog: Catalog,
 ) -> None:
     (scaled,) = of_kind("cpu", "ScaledObject")
     (trigger,) = scaled["spec"]["triggers"]
@@ -486,11 +478,11 @@ def test_extractors_are_scaled_by_the_jobs_that_wait_for_them_or_are_under_way(
     assert reference == authentication["metadata"]["name"]
 
     def counted() -> int:
-        with on_postgres.read() as session:
+        with catalog.read() as session:
             return int(session.execute(text(trigger["metadata"]["query"])).scalar_one())
 
     assert counted() == 0
-    with on_postgres.write() as session:
+    with catalog.write() as session:
         map_id = add_map(session, "default", "test-tiny-avg").id
         for kind in JobKind:
             for state in JobState:
@@ -498,6 +490,6 @@ def test_extractors_are_scaled_by_the_jobs_that_wait_for_them_or_are_under_way(
             waits = {"state": JobState.QUEUED, "waiting_for": WaitingFor.DESCRIPTORS}
             session.add(Job(map_id=map_id, kind=kind, priority=1, **waits))
     assert counted() == 2 * len(EXTRACTOR_JOBS)  # queued and running
-    with on_postgres.write() as session:
+    with catalog.write() as session:
         session.execute(update(Job).values(state=JobState.SUCCEEDED))
     assert counted() == 0

@@ -5,10 +5,10 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
-import httpx2
 import pytest
 
 from tests.support.photos import photo_bytes
+from tests.support.problems import got
 from tests.support.server import ServerProcess
 
 SETTINGS = {"auto_evaluate_photos": 0}
@@ -16,11 +16,6 @@ ENOUGH = 60  # to tell one in twenty
 ASKED = range(0, ENOUGH, 3)
 MANY = 60  # more than an estimate looks at
 fresh = itertools.count(9000)
-
-
-def got(answer: httpx2.Response, status: int = 200) -> Any:
-    assert answer.status_code == status, answer.text
-    return answer.json()
 
 
 def re_encoded(number: int) -> bytes:

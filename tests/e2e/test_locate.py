@@ -8,12 +8,10 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
-from PIL import Image
-from PIL.ExifTags import IFD, Base
 
 from tests.support.photos import (
+    camera_exif,
     encoded,
-    exif_with_position,
     photo_bytes,
     photo_image,
     sidecar_position,
@@ -27,12 +25,9 @@ LONGITUDE = 7.0
 
 def taken(number: int, seconds: float, latitude: float | None = None) -> bytes:
     """The photo `number` so many seconds after noon."""
-    exif = Image.Exif() if latitude is None else exif_with_position(latitude, LONGITUDE)
-    exif[Base.Model] = "Camera"
+    position = None if latitude is None else (latitude, LONGITUDE)
     clock = NOON + timedelta(seconds=seconds)
-    details = exif.get_ifd(IFD.Exif)
-    details[Base.DateTimeOriginal] = f"{clock:%Y:%m:%d %H:%M:%S}"
-    details[Base.BodySerialNumber] = "1"  # all photos are of one camera
+    exif = camera_exif(clock, position, model="Camera", serial="1")  # all are of one camera
     return encoded(photo_image(number), "JPEG", quality=90, exif=exif)
 
 

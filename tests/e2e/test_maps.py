@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-import httpx2
-
 from tests.support.photos import near_copy, photo_bytes
-from tests.support.problems import field_refused, problem
+from tests.support.problems import field_refused, got, problem
 from tests.support.server import CommandLine, ServerProcess
 
 SETTINGS = {"auto_evaluate_photos": 0}
@@ -31,11 +29,6 @@ BODIES: dict[str, Any] = {
 """What calls with JSON need, by the end of their paths."""
 fresh = itertools.count(7000)
 names = (f"town-{number}" for number in itertools.count())
-
-
-def got(answer: httpx2.Response, status: int = 200) -> Any:
-    assert answer.status_code == status, answer.text
-    return answer.json()
 
 
 def make(server: ServerProcess, **params: Any) -> str:

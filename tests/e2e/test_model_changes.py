@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.support.photos import photo_bytes
-from tests.support.problems import problem
+from tests.support.problems import got, problem
 from tests.support.server import ServerProcess
 
 # An extractor without a vocabulary of its own, in a map with too few photos to fit one by itself.
@@ -24,11 +24,6 @@ PHOTOS = 12
 WIDTH = 16  # of the tiny extractor's local features
 VOCABULARIES = "/api/v1/vocabularies"
 GENERATIONS = "/api/v1/generations"
-
-
-def got(answer: httpx2.Response) -> Any:
-    assert answer.status_code == 200, answer.text
-    return answer.json()
 
 
 def started(answer: httpx2.Response) -> str:
@@ -48,12 +43,12 @@ def npy(array: NDArray[Any]) -> bytes:
     return buffer.getvalue()
 
 
-def centres(seed: int, clusters: int = 8, width: int = WIDTH) -> NDArray[np.float32]:
-    return np.random.default_rng(seed).standard_normal((clusters, width)).astype(np.float32)
+def centres(seed: int) -> NDArray[np.float32]:
+    return np.random.default_rng(seed).standard_normal((8, WIDTH)).astype(np.float32)
 
 
-def post_import(server: ServerProcess, data: bytes, name: str = "c.npy") -> httpx2.Response:
-    return server.client.post(f"{VOCABULARIES}/import", files={"file": (name, data)})
+def post_import(server: ServerProcess, data: bytes) -> httpx2.Response:
+    return server.client.post(f"{VOCABULARIES}/import", files={"file": ("c.npy", data)})
 
 
 def done(server: ServerProcess, answer: httpx2.Response) -> dict[str, Any]:

@@ -7,20 +7,12 @@ import socket
 from pathlib import Path
 from typing import Any
 
-import httpx2
-
 from shared.config.embedded_home import server_address_file
 from tests.support.photos import photo_bytes
-from tests.support.problems import problem
+from tests.support.problems import got, problem
 from tests.support.server import ServerProcess, environment, run_command
 
 API = "/api/v1"
-
-
-def got(answer: httpx2.Response) -> dict[str, Any]:
-    assert answer.status_code == 200, answer.text
-    body: dict[str, Any] = answer.json()
-    return body
 
 
 # --- what the server tells of itself ---------------------------------------------------------

@@ -8,11 +8,10 @@ from datetime import datetime, timedelta, timezone
 from typing import Any
 from uuid import uuid4
 
-import httpx2
 import pytest
 
 from tests.support.photos import photo_bytes
-from tests.support.problems import field_refused, problem
+from tests.support.problems import field_refused, got, problem
 from tests.support.server import ServerProcess
 
 fresh = itertools.count(3000)
@@ -20,12 +19,6 @@ fresh = itertools.count(3000)
 
 def url(file_id: str, part: str = "") -> str:
     return f"/api/v1/uploads/{file_id}{part}"
-
-
-def got(answer: httpx2.Response) -> dict[str, Any]:
-    assert answer.status_code == 200, answer.text
-    body: dict[str, Any] = answer.json()
-    return body
 
 
 @pytest.fixture(scope="module")

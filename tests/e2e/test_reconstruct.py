@@ -5,7 +5,6 @@ Each test continues the one above.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from tests.support.reconstructable_server import (
     STRAY,
     reconstructable_server,
 )
-from tests.support.server import ServerProcess, environment, run_command
+from tests.support.server import CommandLine, ServerProcess
 
 
 @pytest.fixture(scope="module")
@@ -30,17 +29,13 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
 
 def run(server: ServerProcess, *arguments: str | Path, fails: bool = False) -> str:
     """The command's output."""
-    env = {**environment(server.home), "COLUMNS": "200"}
-    shown = run_command(*arguments, env=env, cwd=server.home.parent)
-    assert bool(shown.returncode) == fails, shown.stdout + shown.stderr
+    shown = CommandLine(server.home.parent, server.home, columns=200)(*arguments)
+    assert bool(shown.code) == fails, shown.stdout + shown.stderr
     return shown.stdout + shown.stderr
 
 
 def result(server: ServerProcess, *arguments: str | Path) -> Any:
-    env = environment(server.home)
-    shown = run_command(*arguments, "--json", env=env, cwd=server.home.parent)
-    assert shown.returncode == 0, shown.stderr
-    return json.loads(shown.stdout)
+    return CommandLine(server.home.parent, server.home)(*arguments, "--json").json()
 
 
 def test_map_without_a_reconstruction_says_how_to_make_one(walk: ServerProcess) -> None:

@@ -6,11 +6,10 @@ import itertools
 from typing import Any
 from uuid import uuid4
 
-import httpx2
 import pytest
 
 from tests.support.photos import photo_bytes
-from tests.support.problems import field_refused, problem
+from tests.support.problems import field_refused, got, problem
 from tests.support.server import ServerProcess
 
 PLACES = 8
@@ -33,12 +32,6 @@ def re_encoded(number: int) -> bytes:
     return photo_bytes(number, quality=50)
 
 
-def answered(answer: httpx2.Response) -> dict[str, Any]:
-    assert answer.status_code == 200, answer.text
-    body: dict[str, Any] = answer.json()
-    return body
-
-
 def ids(body: dict[str, Any]) -> list[str]:
     return [found["image_id"] for found in body["similar_images"]]
 
@@ -47,13 +40,13 @@ def scores(body: dict[str, Any]) -> list[float]:
     return [found["similarity_score"] for found in body["similar_images"]]
 
 
-def stats(server: ServerProcess) -> dict[str, Any]:
-    return answered(server.client.get("/api/v1/database/stats"))
+def stats(server: ServerProcess) -> Any:
+    return got(server.client.get("/api/v1/database/stats"))
 
 
 def test_a_near_copy_finds_its_place_first(server: ServerProcess, places: list[str]) -> None:
     for number, place in enumerate(places, start=1):
-        body = answered(server.ask(photo_bytes(number), top_k=3))
+        body = got(server.ask(photo_bytes(number), top_k=3))
         assert ids(body)[0] == place
         best = body["similar_images"][0]
         assert best["original_filename"] == f"place-{number}.jpg"
@@ -83,7 +76,7 @@ def test_a_photo_that_is_not_described_yet_says_what_to_wait_for(server: ServerP
         assert body["state"] in ("queued", "running")
         assert uploaded["status_url"] in body["detail"]
     server.finished(uploaded["job_id"])
-    answered(server.similar(uploaded["file_id"]))
+    got(server.similar(uploaded["file_id"]))
 
 
 def test_a_photo_that_could_not_be_described_says_why(server: ServerProcess) -> None:
@@ -110,7 +103,7 @@ def test_a_query_without_prefer_wait_is_answered_with_a_job(
     job = server.finished(started["job_id"])
     assert (job["state"], job["kind"]) == ("succeeded", "describe")
     assert job["result_url"] == started["result_url"]
-    body = answered(server.client.get(started["result_url"]))
+    body = got(server.client.get(started["result_url"]))
     assert ids(body) == [places[0]], "the query's own top_k and min_score count"
     assert body["query_filename"] == "q.jpg"
 
@@ -121,7 +114,7 @@ def test_a_query_that_takes_longer_than_preferred_becomes_a_job(server: ServerPr
         assert answer.status_code == 202
         assert answer.headers["preference-applied"] == "wait=1"
     assert server.finished(answer.json()["job_id"])["state"] == "succeeded"
-    answered(server.client.get(answer.json()["result_url"]))
+    got(server.client.get(answer.json()["result_url"]))
 
 
 def test_only_queries_have_results(server: ServerProcess) -> None:
@@ -133,8 +126,8 @@ def test_every_search_counts_and_no_query_photo_is_kept(
     server: ServerProcess, places: list[str]
 ) -> None:
     before = stats(server)
-    answered(server.similar(places[0]))
-    answered(server.ask(photo_bytes(next(fresh))))
+    got(server.similar(places[0]))
+    got(server.ask(photo_bytes(next(fresh))))
     problem(server.similar(str(uuid4())), 404, "photo_not_found")
     after = stats(server)
     for figure in ("total_searches", "recent_searches_24h"):

@@ -185,8 +185,7 @@ def test_catalog_killed_under_uploads_loses_nothing_that_was_acknowledged(
     ]
     for uploader in uploaders:
         uploader.start()
-    while len(acknowledged) < 8:
-        time.sleep(0.01)
+    wait_until(lambda: len(acknowledged) >= 8)
     breakable.process.kill()
     try:
         assert refused.wait(ANSWER_SECONDS)

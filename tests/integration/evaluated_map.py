@@ -35,7 +35,14 @@ from shared.search_api.protocol import (
     SearchStatus,
 )
 from shared.storage import FolderStore
-from tests.support.catalog_rows import add_chunk, add_generation, add_map, add_photo, read_job
+from tests.support.catalog_rows import (
+    add_chunk,
+    add_generation,
+    add_map,
+    add_photo,
+    read_job,
+    result_of,
+)
 
 Seen = tuple[float, dict[str, Any]]
 """A photo: its angle in degrees, and what is known of it (columns of `Photo`)."""
@@ -87,10 +94,7 @@ class EvaluatedMap:
         """What an evaluation of now comes to."""
         job_id = self.start(**params)
         assert self.work()
-        job = read_job(self.catalog, job_id)
-        assert job.state == "succeeded", job.error
-        assert job.result is not None
-        return job.result
+        return result_of(read_job(self.catalog, job_id))
 
     def evaluations(self) -> list[Evaluation]:
         """All of the map, oldest first."""

@@ -13,6 +13,7 @@ from services.extractor.worker import ExtractorWorker
 from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
 from services.search.worker import SearchWorker
+from services.steward.tasks.model_changes import advance_model_changes
 from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups
@@ -83,6 +84,23 @@ class Service:
         params = {"map": map_name, **params}
         started = self.json("POST", "/similarity", 202, params=params, files=files)
         return str(started["job_id"])
+
+    def ended(self, job_id: str, map_name: str = "default") -> Any:
+        """The job once extractor and steward have ended it."""
+        for _ in range(60):
+            self.drain()
+            advance_model_changes(self.catalog, self.wakeups)
+            job = self.json("GET", f"/jobs/{job_id}", params={"map": map_name})
+            if job["state"] not in ("queued", "running"):
+                return job
+        raise AssertionError(f"the job did not end: {job}")
+
+    def done(self, started: httpx2.Response, map_name: str = "default") -> Any:
+        """The result of the job that the answer names."""
+        assert started.status_code == 202, started.text
+        job = self.ended(started.json()["job_id"], map_name)
+        assert job["state"] == "succeeded", job
+        return job["result"]
 
     def drain(self) -> None:
         stop = threading.Event()

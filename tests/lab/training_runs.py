@@ -82,27 +82,19 @@ ZONE = "@32@T"
 APART_M = 100.0
 
 
-def write_tiny_places(
-    root: Path,
-    *,
-    places: int = 6,
-    photos: int = 4,
-    side: int = 48,
-    city: str = CITY,
-    light: float = 0.0,
-) -> Path:
+def write_tiny_places(root: Path, *, places: int = 6, light: float = 0.0) -> Path:
     """gsv_xs below `root/gsv_xs`, and `root/database`, `root/queries` of other places.
 
     Each photo is taken in light of its own colour: red, green and blue lose up to this share.
     """
-    train = root / "gsv_xs" / "train" / city
+    train = root / "gsv_xs" / "train" / CITY
     rows = []
     for place in range(places):
-        for number in range(photos):
+        for number in range(4):
             name = f"{_where(place)}@x@@@@@@@2024@{place}_{number}@.jpg"
-            _draw(train / name, place, number, side, light)
-            rows.append((place, city, f"{500_000 + place * APART_M:.2f}", "4880000.00", name))
-    table = root / "gsv_xs" / "dataframes" / f"{city}.csv"
+            _draw(train / name, place, number, light)
+            rows.append((place, CITY, f"{500_000 + place * APART_M:.2f}", "4880000.00", name))
+    table = root / "gsv_xs" / "dataframes" / f"{CITY}.csv"
     table.parent.mkdir(parents=True, exist_ok=True)
     with table.open("w", newline="") as file:
         csv.writer(file).writerows([("place_id", "class_name", "UTMx", "UTMy", "filename"), *rows])
@@ -110,7 +102,7 @@ def write_tiny_places(
         for folder, numbers in (("database", (0, 1)), ("queries", (2,))):
             for number in numbers:
                 name = f"{_where(place)}@{place}_{number}@@@@@@@@@.jpg"
-                _draw(root / folder / name, place, number, side, light)
+                _draw(root / folder / name, place, number, light)
     return root
 
 
@@ -118,14 +110,14 @@ def _where(place: int) -> str:
     return f"@{500_000 + place * APART_M:010.2f}@{4_880_000:010.2f}{ZONE}@@"
 
 
-def _draw(path: Path, place: int, number: int, side: int, light: float) -> None:
+def _draw(path: Path, place: int, number: int, light: float) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     coarse = np.random.default_rng(place).integers(0, 255, (6, 6, 3))
     rng = np.random.default_rng((place, number))
     own = rng.integers(-30, 30, (6, 6, 3))
     colour = 1 - light * rng.random(3)
     pixels = np.clip((coarse + own) * colour, 0, 255).astype(np.uint8)
-    Image.fromarray(pixels).resize((side, side), Image.Resampling.BICUBIC).save(path, quality=90)
+    Image.fromarray(pixels).resize((48, 48), Image.Resampling.BICUBIC).save(path, quality=90)
 
 
 class StopAfter(NullDisplay):

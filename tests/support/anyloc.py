@@ -48,10 +48,10 @@ CREATE INDEX idx_search_time ON search_history(search_time);
 class AnylocInstallation:
     """One that grows: `backend/app/` with its database in WAL mode, its uploads and the rest."""
 
-    def __init__(self, root: Path, app: str = "backend/app") -> None:
+    def __init__(self, root: Path) -> None:
         self.root = root
-        self.models = root / app / "models"
-        self.uploads = root / app / "uploads"
+        self.models = root / "backend" / "app" / "models"
+        self.uploads = root / "backend" / "app" / "uploads"
         self.uploads.mkdir(parents=True)
         (self.models / "features").mkdir(parents=True)
         (self.models / "features" / "chunk_0.npy").write_bytes(b"375 MiB of zeros, mostly")

@@ -320,6 +320,13 @@ def problem_of(job: Job) -> dict[str, Any]:
     return job.error
 
 
+def result_of(job: Job) -> dict[str, Any]:
+    """The result of a job that has succeeded."""
+    assert job.state == JobState.SUCCEEDED, job.error
+    assert job.result is not None
+    return job.result
+
+
 def failure_code(job: Job) -> str:
     assert job.state == JobState.FAILED
     return str(problem_of(job)["code"])

@@ -57,8 +57,8 @@ def some_checkpoint(seed: int = 0) -> bytes:
     return checkpoint_of(untrained(seed))
 
 
-def write_checkpoint(path: Path, seed: int = 0) -> Path:
-    path.write_bytes(some_checkpoint(seed))
+def write_checkpoint(path: Path) -> Path:
+    path.write_bytes(some_checkpoint())
     return path
 
 

@@ -11,8 +11,10 @@ import hashlib
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 from typing import Any
+
+from tests.support.fake_server import QuietHandler, serving
 
 HUB_COMMIT = "9" * 40
 
@@ -42,17 +44,14 @@ class FilesServer:
         return hashlib.sha256(self.promised.get(path, self.files[path])).hexdigest()
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(QuietHandler):
     protocol_version = "HTTP/1.1"
     server: Any
 
-    def log_message(self, *_arguments: object) -> None:
-        """Tests print nothing."""
-
-    def do_HEAD(self) -> None:
+    def do_HEAD(self) -> None:  # noqa: N802
         self._answer(send=False)
 
-    def do_GET(self) -> None:
+    def do_GET(self) -> None:  # noqa: N802
         self._answer(send=True)
 
     def _answer(self, *, send: bool) -> None:
@@ -106,15 +105,11 @@ class _Handler(BaseHTTPRequestHandler):
 @contextlib.contextmanager
 def files_server() -> Iterator[FilesServer]:
     """A server on a free port until the block ends."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), _Handler)
-    shown = FilesServer(url=f"http://127.0.0.1:{server.server_port}")
-    server.shown = shown  # type: ignore[attr-defined]
-    serving = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-    serving.start()
-    try:
-        yield shown
-    finally:
-        shown.go_on.set()
-        server.shutdown()
-        serving.join()
-        server.server_close()
+    with ThreadingHTTPServer(("127.0.0.1", 0), _Handler) as server:
+        shown = FilesServer(url=f"http://127.0.0.1:{server.server_port}")
+        server.shown = shown  # type: ignore[attr-defined]
+        with serving(server):
+            try:
+                yield shown
+            finally:
+                shown.go_on.set()

@@ -13,12 +13,12 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from hashlib import sha1
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 from typing import Any
 from urllib.parse import urlsplit
 from uuid import UUID, uuid4
 
-from tests.support.fake_server import serving
+from tests.support.fake_server import QuietHandler, serving
 
 KEY = "immich-key"
 USER, PARTNER = str(uuid4()), str(uuid4())
@@ -158,7 +158,7 @@ class ImmichServer(ThreadingHTTPServer):
         return 204, b"", {}
 
 
-class Handler(BaseHTTPRequestHandler):
+class Handler(QuietHandler):
     server: ImmichServer
 
     def handle_call(self) -> None:
@@ -173,16 +173,9 @@ class Handler(BaseHTTPRequestHandler):
         else:
             status, answer, headers = refused(401, "Invalid API key")
         data = answer if isinstance(answer, bytes) else json.dumps(answer).encode()
-        self.send_response(status)
-        for name, value in {"Content-Length": str(len(data)), **headers}.items():
-            self.send_header(name, value)
-        self.end_headers()
-        self.wfile.write(data)
+        self.reply(status, data, headers)
 
     do_GET = do_POST = do_PUT = handle_call  # noqa: N815
-
-    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
-        """Keep the test's output clean."""
 
 
 def time_text(time: datetime) -> str:

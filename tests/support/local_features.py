@@ -54,7 +54,7 @@ def feature_rows(*photos: LocalFeatures | None, model: str = MODEL) -> FeatureRo
 
 
 def add_features(
-    catalog: Catalog, store: ObjectStore, photos: Mapping[UUID, LocalFeatures], model: str = MODEL
+    catalog: Catalog, store: ObjectStore, photos: Mapping[UUID, LocalFeatures]
 ) -> None:
     """Store features of described photos beside their chunks; other photos have none."""
     with catalog.write() as session:
@@ -63,5 +63,5 @@ def add_features(
             described = select(Descriptor).where(Descriptor.chunk_id == chunk.id)
             for descriptor in session.scalars(described):
                 rows[descriptor.row] = photos.get(descriptor.photo_id)
-            put_features(store, *rows, model=model, key=features_key(chunk.object_key))
-            chunk.features_model = model
+            put_features(store, *rows, key=features_key(chunk.object_key))
+            chunk.features_model = MODEL

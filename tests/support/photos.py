@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,28 @@ def turned_photo(upright: Image.Image, orientation: int, media: str, **options: 
     exif[Base.Orientation] = orientation
     stored = upright if undo is None else upright.transpose(undo)
     return encoded(stored, media, exif=exif, **options)
+
+
+def camera_exif(
+    clock: datetime | None = None,
+    position: tuple[float, float] | None = None,
+    *,
+    offset: str | None = None,
+    model: str | None = None,
+    serial: str | None = None,
+) -> Image.Exif:
+    """EXIF with what is given: the camera, its clock, and a position as below."""
+    exif = Image.Exif() if position is None else exif_with_position(*position)
+    details: dict[int, str | None] = {
+        Base.DateTimeOriginal: None if clock is None else f"{clock:%Y:%m:%d %H:%M:%S}",
+        Base.OffsetTimeOriginal: offset,
+        Base.BodySerialNumber: serial,
+    }
+    if given := {tag: value for tag, value in details.items() if value}:
+        exif.get_ifd(IFD.Exif).update(given)
+    if model:
+        exif[Base.Model] = model
+    return exif
 
 
 def exif_with_position(latitude: float, longitude: float) -> Image.Exif:

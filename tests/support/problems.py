@@ -1,10 +1,16 @@
-"""What every error of the API looks like: RFC 9457, with a stable code."""
+"""Answers of the API: bodies of those that succeed, and errors by RFC 9457 with a stable code."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import httpx2
+
+
+def got(answer: httpx2.Response, status: int = 200) -> Any:
+    """The body of an answer with this status."""
+    assert answer.status_code == status, answer.text
+    return answer.json()
 
 
 def problem(answer: httpx2.Response, status: int, code: str) -> dict[str, Any]:

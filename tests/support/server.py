@@ -100,9 +100,12 @@ class CommandLine:
     def __init__(self, folder: Path, home: Path, **settings: Any) -> None:
         self.folder = folder
         self.environment = environment(home, **settings)
+        self.seconds = COMMAND_SECONDS
 
     def __call__(self, *arguments: str | Path) -> Run:
-        return Run(run_command(*arguments, env=self.environment, cwd=self.folder))
+        return Run(
+            run_command(*arguments, env=self.environment, cwd=self.folder, seconds=self.seconds)
+        )
 
 
 class ServerProcess:

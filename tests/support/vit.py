@@ -21,9 +21,9 @@ WITH_REGISTERS = VitShape("vit_small_patch14_dinov2", depth=2, width=32, heads=2
 SIDE = 37  # of the grid of learnt positions
 
 
-def random_weights(shape: VitShape, blocks: int | None = None, seed: int = 0) -> Weights:
+def random_weights(shape: VitShape, blocks: int | None = None) -> Weights:
     """Every tensor of such a network under Meta's names; `blocks` limits their number."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
 
     def random(*size: int, scale: float, around: float = 0.0) -> torch.Tensor:
         values = around + scale * rng.standard_normal(size, dtype=np.float32)
@@ -61,11 +61,11 @@ def random_weights(shape: VitShape, blocks: int | None = None, seed: int = 0) ->
     return weights
 
 
-def chunked(weights: Weights, size: int = 2) -> Weights:
+def chunked(weights: Weights) -> Weights:
     """Meta's names as its sharded training writes them: blocks in chunks, counted through."""
 
     def name(match: re.Match[str]) -> str:
-        return f"blocks.{int(match[1]) // size}.{match[1]}."
+        return f"blocks.{int(match[1]) // 2}.{match[1]}."
 
     return {re.sub(r"^blocks\.(\d+)\.", name, key): value for key, value in weights.items()}
 

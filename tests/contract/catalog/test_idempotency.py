@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from concurrent.futures import ThreadPoolExecutor
-
 import pytest
 from sqlalchemy import func, select, update
 
@@ -13,7 +10,6 @@ from services.steward.tasks.maintenance import delete_expired_idempotency_keys
 from shared.catalog.database.base import db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.idempotency import StoredResponse, find_response, store_response
-from shared.errors import Unprocessable
 
 SCOPE, KEY, CALL, OTHER_CALL = "someone", "key-1", "f" * 64, "0" * 64
 BODY = '{"name":"citè","b":1,"a":null}'
@@ -48,34 +44,6 @@ def rows(catalog: Catalog) -> int:
 def expire(catalog: Catalog) -> None:
     with catalog.write() as session:
         session.execute(update(StoredResponse).values(expires_at=db_now_plus(-1)))
-
-
-def test_a_stored_response_is_found_unchanged_by_its_scope_and_key(catalog: Catalog) -> None:
-    assert find(catalog) is None
-    assert keep(catalog) == BODY
-    assert find(catalog) == (201, {"Location": "/there"}, BODY)
-    assert find(catalog, scope="someone else") is None
-    assert find(catalog, key="key-2") is None
-
-
-def test_another_call_under_the_key_is_refused(catalog: Catalog) -> None:
-    keep(catalog)
-    with pytest.raises(Unprocessable, match="Use a new key"):
-        find(catalog, fingerprint=OTHER_CALL)
-    with pytest.raises(Unprocessable, match="Use a new key"):
-        keep(catalog, fingerprint=OTHER_CALL)
-
-
-def test_of_concurrent_responses_the_first_is_stored(catalog: Catalog) -> None:
-    together = threading.Barrier(8)
-
-    def one(number: int) -> str:
-        together.wait(timeout=30)
-        return keep(catalog, str(number))
-
-    with ThreadPoolExecutor(8) as pool:
-        assert len(set(pool.map(one, range(8)))) == 1
-    assert rows(catalog) == 1
 
 
 def test_expired_keys_are_deleted_and_free_for_any_call(

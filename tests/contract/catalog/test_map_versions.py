@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from uuid import UUID
 
 import pytest
@@ -24,6 +22,7 @@ from shared.catalog.photos import (
 )
 from shared.errors import NotFound
 from tests.support.catalog_rows import add_map, add_photo, delete
+from tests.support.threads import at_once
 
 
 def test_versions_are_strictly_increasing_under_concurrent_bumps(
@@ -38,8 +37,7 @@ def test_versions_are_strictly_increasing_under_concurrent_bumps(
                 seen.append(increment_map_version(session, map_id))
         return seen
 
-    with ThreadPoolExecutor(threads) as pool:
-        by_thread = [future.result() for future in [pool.submit(bump) for _ in range(threads)]]
+    by_thread = at_once(*[bump] * threads)
     assert all(seen == sorted(seen) for seen in by_thread)
     assert sorted(version for seen in by_thread for version in seen) == list(
         range(1, threads * each + 1)
@@ -59,15 +57,11 @@ def test_versions_are_strictly_increasing_under_concurrent_bumps(
 def test_a_row_that_many_create_at_once_is_created_once(
     catalog: Catalog, get_or_create: Callable[[Session], Map | Model]
 ) -> None:
-    together = threading.Barrier(4)
-
     def create() -> Map | Model:
-        together.wait()
         with catalog.write() as session:
             return get_or_create(session)
 
-    with ThreadPoolExecutor(4) as pool:
-        created = [future.result() for future in [pool.submit(create) for _ in range(4)]]
+    created = at_once(*[create] * 4)
     with catalog.read() as session:
         assert session.scalars(select(type(created[0]).id)).one() == created[0].id
     assert len({row.id for row in created}) == 1

@@ -174,19 +174,6 @@ def test_a_photo_inserted_between_two_pages_shifts_no_other(catalog: Catalog, ma
     assert sorted(photo.id for photo in seen) == sorted(ids)
 
 
-def test_the_total_counts_what_matches_and_not_the_page(catalog: Catalog, map_id: UUID) -> None:
-    with catalog.write() as session:
-        for number in range(7):
-            add_photo(session, map_id, tags=["odd"] if number % 2 else [], uploaded_at=MOMENT)
-    odd = MetadataSearchParams(tags="odd")
-    with catalog.read() as session:
-        first, total = search_photos(session, map_id, odd, 2, None)
-        assert (len(first), total) == (2, 3)
-        after = (first[-1].uploaded_at, first[-1].id)
-        rest, total = search_photos(session, map_id, odd, 2, after)
-        assert (len(rest), total) == (1, 3)
-
-
 def test_a_missing_json_value_is_null_for_the_database(catalog: Catalog, map_id: UUID) -> None:
     with catalog.write() as session:
         add_job(session, map_id, error=None)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from uuid import UUID
 
 import pytest
@@ -23,6 +22,7 @@ from shared.ingest.photo_metadata import PhotoFields
 from shared.ingest.store_photo import StoreResult, insert_photo
 from shared.ingest.validation import StoredUpload, ValidatedPhoto
 from tests.support.catalog_rows import add_map
+from tests.support.threads import at_once
 
 NAME = "of the photo"
 
@@ -96,14 +96,8 @@ def test_the_returned_rows_are_those_of_the_catalog(catalog: Catalog, map_id: UU
 
 
 def test_the_same_bytes_by_several_at_once_are_stored_once(catalog: Catalog, map_id: UUID) -> None:
-    start = threading.Barrier(4)
-
-    def upload(number: int) -> StoreResult:
-        start.wait()
-        return store(catalog, photo(key=f"originals/{number}"))
-
-    with ThreadPoolExecutor(4) as pool:
-        results = list(pool.map(upload, range(4)))
+    sent = [photo(key=f"originals/{number}") for number in range(4)]
+    results = at_once(*(partial(store, catalog, each) for each in sent))
     assert len({result.photo.id for result in results}) == 1
     assert sum(result.queued for result in results) == 1
     with catalog.read() as session:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import itertools
-import threading
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from uuid import UUID
 
 import pytest
 from sqlalchemy import select
 
 from shared.catalog.database.base import db_now, db_now_plus
-from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import GenerationState
 from shared.catalog.jobs import SINGLE_CLAIM_JOBS, Priority, WaitingFor, get_job, list_jobs
@@ -25,7 +23,7 @@ from tests.support.catalog_rows import (
     set_columns,
     take,
 )
-from tests.support.servers import PostgresServer
+from tests.support.threads import at_once
 
 
 def test_jobs_are_claimed_by_priority_then_by_age(catalog: Catalog, map_id: UUID) -> None:
@@ -41,13 +39,6 @@ def test_jobs_are_claimed_by_priority_then_by_age(catalog: Catalog, map_id: UUID
     order = [job_id for _, job_id in sorted(made, key=lambda pair: pair[0])]
     assert [job_id for _ in expected for job_id in ids(take(catalog, limit=1))] == order
     assert take(catalog) == []
-
-
-def test_a_claim_takes_the_oldest_jobs_up_to_its_limit(catalog: Catalog, map_id: UUID) -> None:
-    waiting = queue(catalog, map_id, 5)
-    assert ids(take(catalog, limit=3)) == waiting[:3]
-    assert ids(take(catalog, limit=3)) == waiting[3:]
-    assert take(catalog, limit=3) == []
 
 
 def test_a_claim_names_the_worker_and_the_end_of_its_lease(catalog: Catalog, map_id: UUID) -> None:
@@ -142,22 +133,18 @@ def test_a_claim_with_a_minimum_priority_takes_no_job_below_it(
 
 def test_workers_that_claim_at_once_never_get_the_same_job(catalog: Catalog, map_id: UUID) -> None:
     waiting = queue(catalog, map_id, 200) + queue(catalog, map_id, 50, alone=True)
-    workers = 4
-    together = threading.Barrier(workers)
 
     def work(name: str) -> list[tuple[UUID, UUID]]:
         # A catalog of its own, as another process has it: no lock in memory is shared.
         mine = Catalog(catalog.url.render_as_string(hide_password=False))
         got = []
-        together.wait()
         while jobs := take(mine, limit=7, worker=name):
             got += [(job.id, token_of(jobs)) for job in jobs]
         mine.close()
         return got
 
-    with ThreadPoolExecutor(workers) as pool:
-        futures = [pool.submit(work, f"worker-{number}") for number in range(workers)]
-        taken = [pair for future in futures for pair in future.result()]
+    got = at_once(*(partial(work, f"worker-{number}") for number in range(4)))
+    taken = [pair for pairs in got for pair in pairs]
     assert len(taken) == len(waiting)
     assert {job_id for job_id, _ in taken} == set(waiting)
     with catalog.read() as session:
@@ -165,12 +152,9 @@ def test_workers_that_claim_at_once_never_get_the_same_job(catalog: Catalog, map
     assert stored == set(taken)
 
 
-def test_a_claim_skips_jobs_that_another_claim_has_locked(postgres: PostgresServer) -> None:
-    """PostgreSQL alone: SQLite's one writer makes the second worker wait its turn."""
-    catalog = Catalog(postgres.new_database())
-    migrate(catalog)
-    with catalog.write() as session:
-        map_id = add_map(session).id
+@pytest.mark.databases("postgresql")
+def test_a_claim_skips_jobs_that_another_claim_has_locked(catalog: Catalog, map_id: UUID) -> None:
+    """SQLite's one writer makes the second worker wait its turn."""
     waiting = queue(catalog, map_id, 6)
     with catalog.write() as first:
         one = claim_jobs(first, worker="one", limit=2, lease_seconds=60)
@@ -178,7 +162,6 @@ def test_a_claim_skips_jobs_that_another_claim_has_locked(postgres: PostgresServ
         two = take(catalog, limit=3, worker="two")
     assert ids(one) == waiting[:2]
     assert ids(two) == waiting[2:5]
-    catalog.close()
 
 
 def test_jobs_of_a_map_are_listed_newest_first_and_filtered(catalog: Catalog, map_id: UUID) -> None:

@@ -15,7 +15,6 @@ from sqlalchemy import select
 from sqlalchemy.exc import OperationalError
 
 from shared.catalog.database.base import db_now, db_now_plus
-from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState
 from shared.ids import new_id
@@ -30,7 +29,6 @@ from tests.contract.jobs.jobs import end, free, ids, queue, token_of
 from tests.support.catalog_rows import (
     add_generation,
     add_job,
-    add_map,
     expire_lease,
     failure_code,
     is_lock_awaited,
@@ -39,18 +37,15 @@ from tests.support.catalog_rows import (
     states,
     take,
 )
-from tests.support.servers import PostgresServer
 
 
+@pytest.mark.databases("postgresql")
 def test_extending_a_lease_locks_its_jobs_in_the_order_of_finishing_them(
-    postgres: PostgresServer,
+    catalog: Catalog, map_id: UUID
 ) -> None:
     """PostgreSQL alone. In two orders the lease's thread and the worker's meet in a deadlock."""
-    catalog = Catalog(postgres.new_database())
-    migrate(catalog)
     low, high = new_id(), new_id()
     with catalog.write() as session:
-        map_id = add_map(session).id
         add_job(session, map_id, id=high)  # the table's order is not that of the ids
         add_job(session, map_id, id=low)
     jobs = take(catalog)
@@ -71,7 +66,6 @@ def test_extending_a_lease_locks_its_jobs_in_the_order_of_finishing_them(
             second = select(Job.id).where(Job.id == high).with_for_update(nowait=True)
             assert session.scalar(second) == high
         assert extending.result()
-    catalog.close()
 
 
 def test_a_worker_whose_lease_was_taken_over_finishes_no_job(

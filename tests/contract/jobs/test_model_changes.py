@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -29,7 +28,7 @@ from shared.jobs.model_changes import (
     start_model_change,
 )
 from shared.storage import FolderStore
-from tests.contract.jobs.jobs import end, ids, queue, token_of
+from tests.contract.jobs.jobs import queue, token_of
 from tests.support.catalog_rows import (
     add_chunk,
     add_generation,
@@ -40,6 +39,7 @@ from tests.support.catalog_rows import (
     states,
     take,
 )
+from tests.support.threads import at_once
 
 
 def test_a_second_model_change_is_refused_and_names_the_first(
@@ -61,18 +61,14 @@ def test_a_second_model_change_is_refused_and_names_the_first(
 
 
 def test_one_of_two_concurrent_model_changes_is_accepted(catalog: Catalog, map_id: UUID) -> None:
-    together = threading.Barrier(4)
-
     def start() -> UUID | str:
-        together.wait()
         try:
             with catalog.write() as session:
                 return start_model_change(session, map_id, JobKind.FIT, {}).id
         except Conflict as error:
             return str(error.extra["job_id"])
 
-    with ThreadPoolExecutor(4) as pool:
-        outcomes = [future.result() for future in [pool.submit(start) for _ in range(4)]]
+    outcomes = at_once(*[start] * 4)
     (winner,) = [outcome for outcome in outcomes if isinstance(outcome, UUID)]
     assert outcomes.count(str(winner)) == 3
 
@@ -92,32 +88,6 @@ def test_the_first_generation_of_a_map_is_active_at_once_and_outlives_its_cancel
         cancel_model_change(session, get_job(session, map_id, job_id, lock=True))
     with catalog.read() as session:
         assert session.scalars(select(Generation.state)).all() == [GenerationState.ACTIVE]
-
-
-def test_a_cancelled_model_change_abandons_what_it_was_building(
-    catalog: Catalog, map_id: UUID
-) -> None:
-    with catalog.write() as session:
-        active = add_generation(session, map_id).id
-    job_id = _begin(catalog, map_id)
-    building = read_job(catalog, job_id).generation_id
-    first, second = queue(catalog, map_id, 2, kind=JobKind.REINDEX, generation_id=building)
-    done = queue(
-        catalog, map_id, kind=JobKind.REINDEX, generation_id=building, state=JobState.FAILED
-    )
-    uploads = queue(catalog, map_id)
-    (running,) = take(catalog, limit=1)  # the upload: higher
-    jobs = take(catalog, limit=1)
-    assert (running.id, ids(jobs)) == (uploads[0], [first])
-    with catalog.write() as session:
-        cancel_model_change(session, get_job(session, map_id, job_id, lock=True))
-    assert states(catalog, [job_id, first, second]) == [JobState.CANCELLED] * 3
-    assert states(catalog, [*done, *uploads]) == [JobState.FAILED, JobState.RUNNING]
-    assert end(catalog, jobs) == []  # the worker that has one computes in vain
-    with catalog.read() as session:
-        assert session.get_one(Generation, active).state == GenerationState.ACTIVE
-        assert session.get_one(Generation, building).state == GenerationState.ABANDONED
-    _begin(catalog, map_id)  # there is room for the next
 
 
 def test_the_jobs_of_a_cancelled_model_change_are_cancelled_in_small_transactions(

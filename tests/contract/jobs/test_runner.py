@@ -13,13 +13,12 @@ from shared.catalog.jobs import Job, JobKind, JobState
 from shared.config.settings import Settings
 from shared.errors import Unavailable, Unprocessable
 from shared.jobs.runner import (
-    MAX_ATTEMPTS,
     JobInterrupted,
     JobRunner,
     StepOutcome,
     reclaim_expired_leases,
 )
-from tests.support.catalog_rows import add_job, add_map, failure_code, read_job, take
+from tests.support.catalog_rows import add_job, add_map, read_job, take
 
 KINDS = (JobKind.INDEX, JobKind.DESCRIBE, JobKind.EVALUATE)
 UNAVAILABLE = Unavailable("object_store_unavailable", "The object store is unreachable.")
@@ -82,35 +81,6 @@ def test_a_failure_requeues_or_fails_the_job(
     is_delayed = state == "queued" and outcome in (StepOutcome.PAUSED, StepOutcome.FAILED)
     assert (job.run_after is not None) is is_delayed
     assert recorder.outcomes == [(kind, outcome, 1)]
-
-
-def test_the_jobs_of_a_crashed_batch_are_retried_alone_until_the_cause_fails(
-    catalog: Catalog, recorder: Recorder, settings: Settings
-) -> None:
-    good, bad = queue(catalog, JobKind.INDEX, 2)
-    claimed = recorder.runner.claim(limit=2)
-    assert claimed is not None
-    with claimed.lease, recorder.runner.step(claimed):
-        raise RuntimeError("one of the two photos")
-    assert recorder.outcomes == [(JobKind.INDEX, StepOutcome.CRASHED, 2)]
-    assert all(read_job(catalog, job_id).alone for job_id in (good, bad))
-    assert [read_job(catalog, job_id).attempts for job_id in (good, bad)] == [0, 0]
-
-    seen: list[UUID] = []
-
-    def crash_on_bad(job: Job) -> None:
-        seen.append(job.id)
-        if job.id == bad:
-            raise RuntimeError("this photo")
-        with catalog.write() as session:
-            session.get_one(Job, job.id).state = JobState.SUCCEEDED
-
-    while recorder.runner.run_next(crash_on_bad):
-        pass
-    assert seen == [good] + [bad] * MAX_ATTEMPTS
-    failed = read_job(catalog, bad)
-    assert failure_code(failed) == "worker_crashed"
-    assert "RuntimeError" in str(failed.error)
 
 
 def test_a_job_that_was_taken_over_meanwhile_is_left_to_its_new_worker(

@@ -20,7 +20,6 @@ from shared.jobs.runner import MAX_ATTEMPTS
 from shared.jobs.transitions import (
     cancel_job,
     fail_job,
-    requeue_job,
     retry_job,
     succeed_job,
 )
@@ -76,33 +75,6 @@ def test_success_and_failure_are_stored_with_their_figures(catalog: Catalog, map
     assert (done.progress_done, done.progress_failed) == (1, 0)
     assert (failed.error, failed.result) == (PROBLEM, None)
     assert (failed.progress_done, failed.progress_failed) == (0, 1)
-
-
-def test_a_requeued_job_is_claimed_again_without_counting_an_attempt(
-    catalog: Catalog, map_id: UUID
-) -> None:
-    waiting = queue(catalog, map_id, 2)
-    jobs = take(catalog)
-    with catalog.write() as session:
-        one, two = lock_leased_jobs(session, token_of(jobs), jobs)
-        requeue_job(one)
-        requeue_job(two, after_seconds=3600)
-    assert states(catalog, waiting) == [JobState.QUEUED, JobState.QUEUED]
-    assert ids(take(catalog)) == waiting[:1]
-    assert [read_job(catalog, job_id).attempts for job_id in waiting] == [0, 0]
-
-
-def test_a_requeued_model_change_stays_running(catalog: Catalog, map_id: UUID) -> None:
-    for kind in MODEL_CHANGE_JOBS:
-        (job_id,) = queue(catalog, map_id, kind=kind)
-        jobs = take(catalog)
-        with catalog.write() as session:
-            requeue_job(lock_leased_jobs(session, token_of(jobs), jobs)[0])
-        job = read_job(catalog, job_id)
-        assert (job.state, job.lease_token) == (JobState.RUNNING, None)
-        jobs = take(catalog)
-        assert ids(jobs) == [job_id]
-        end(catalog, jobs)
 
 
 def test_retrying_resets_failed_and_cancelled_jobs(catalog: Catalog, map_id: UUID) -> None:

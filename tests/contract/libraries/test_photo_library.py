@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
-from PIL.ExifTags import IFD, Base
+from PIL.ExifTags import Base
 
 from services.cli.immich import api
 from services.cli.immich.library import ImmichLibrary
@@ -21,7 +21,7 @@ from shared.errors import NotFound
 from shared.geotagging.fusion import Proposal
 from shared.imaging.xmp import EXIF, RDF
 from tests.support.immich_server import KEY, NOON, ImmichServer, running_immich
-from tests.support.photos import encoded, exif_with_position, photo_bytes, photo_image
+from tests.support.photos import camera_exif, encoded, photo_bytes, photo_image
 
 TAKEOUT = '{"geoData": {"latitude": 0.0, "longitude": 0.0, "altitude": 0.0}}'
 HERE, THERE = (45.0691, 7.6853), (45.08, 7.69)
@@ -51,11 +51,9 @@ class FolderCase(Case):
         self.library = FolderLibrary(self.folder)
 
     def add(self, number: int, seconds: float, position: tuple[float, float] | None) -> str:
-        exif = exif_with_position(*position) if position else Image.Exif()
-        exif[Base.Make], exif[Base.Model] = "Maker", "X100"
         clock = NOON + timedelta(hours=2, seconds=seconds)
-        exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = f"{clock:%Y:%m:%d %H:%M:%S}"
-        exif.get_ifd(IFD.Exif)[Base.OffsetTimeOriginal] = "+02:00"
+        exif = camera_exif(clock, position, offset="+02:00", model="X100")
+        exif[Base.Make] = "Maker"
         data = encoded(photo_image(number), "JPEG", exif=exif)
         (self.folder / f"IMG_{number}.jpg").write_bytes(data)
         # As Google Takeout writes it for a photo without a place; nothing is to be written into it.

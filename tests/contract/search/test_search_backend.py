@@ -27,6 +27,7 @@ from tests.support.small_map import (
     damaged,
     unit_rows,
 )
+from tests.support.threads import meanwhile
 
 OpenPort = Callable[..., SearchBackend]
 # How rows are scanned has nothing to do with the catalog.
@@ -255,26 +256,15 @@ class AnswersContract:
         reference = places.query(vector)
         search = port()
         responses: list[SearchResponse] = []
-        done = threading.Event()
-
-        def ask() -> None:
-            while not done.is_set():
-                responses.append(search.search(places.request(reference, k=500)))
-
-        threads = [threading.Thread(target=ask) for _ in range(3)]
-        for thread in threads:
-            thread.start()
-        try:
+        with meanwhile(
+            lambda: responses.append(search.search(places.request(reference, k=500))), threads=3
+        ):
             for seed in range(1, 6):
                 rows = unit_rows(seed, 4).astype(places.row_type)
                 photo_ids = places.add(rows)
                 seen |= dict(zip(photo_ids, rows, strict=True))
                 places.delete(photo_ids[1])
                 places.merge()
-        finally:
-            done.set()
-            for thread in threads:
-                thread.join()
         exact = vector.astype(np.float64) / np.linalg.norm(vector.astype(np.float64))
         for response in responses:
             for hit in response.hits:

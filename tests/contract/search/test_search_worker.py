@@ -6,7 +6,6 @@ import os
 import threading
 from typing import Any, BinaryIO
 
-import numpy as np
 import pytest
 
 from services.search import worker as worker_module
@@ -19,7 +18,6 @@ from shared.config.settings import Settings
 from shared.errors import Unavailable
 from shared.search_api.protocol import SearchBackend
 from shared.storage import FolderStore, read_retries
-from shared.storage.chunks import decode_rows
 from tests.contract.search.search_methods import always_by_codes
 from tests.contract.search.test_search_backend import (
     AnswersContract,
@@ -41,22 +39,6 @@ def port(catalog: Catalog, store: FolderStore, settings: Settings) -> OpenPort:
 
 @whatever_the_catalog  # tests of search over HTTP run on PostgreSQL
 class TestSearchWorker(SearchPortContract):
-    def test_repaired_chunk_is_served_again_without_a_new_version(
-        self, places: SmallMap, settings: Settings, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
-        places.add(unit_rows(1, 5))
-        (key,) = places.chunk_keys()
-        whole = places.store.get(key)
-        places.store.put(key, damaged(whole, "flipped"))
-        worker = SearchWorker(places.catalog, places.store, settings)
-        worker.sync()
-        assert worker.status().missing == (key,)
-        places.store.put(key, whole)
-        worker.sync()
-        assert worker.status().missing == ()
-        assert worker.status().rows == 5
-
     def test_damaged_chunk_is_not_read_again_with_every_look_and_every_new_version(
         self, places: SmallMap, settings: Settings, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -248,17 +230,6 @@ class TestSearchWorkerOfFloat16Rows(AnswersContract):
     @pytest.fixture
     def places(self, catalog: Catalog, store: FolderStore) -> SmallMap:
         return SmallMap(catalog, store, RowType.FLOAT16)
-
-    def test_rows_of_a_merged_chunk_equal_the_rows_that_were_written(
-        self, places: SmallMap, store: FolderStore
-    ) -> None:
-        places.add(unit_rows(1, 5))
-        places.add(unit_rows(2, 4), dead=1)
-        assert places.merge()
-        (key,) = places.chunk_keys()
-        rows = decode_rows(store.get(key))
-        assert rows.dtype == np.float16
-        assert np.array_equal(rows, np.stack(list(places.rows.values())))
 
 
 class TestSearchWorkerOfFloat16RowsByCodes(TestSearchWorkerOfFloat16Rows):

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
-import threading
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 
 import httpx2
 import pytest
@@ -25,6 +24,7 @@ from shared.errors import StorageFull, Unavailable
 from shared.jobs import InProcessWakeups, Job
 from shared.storage import FolderStore
 from shared.storage.s3 import S3Store
+from tests.support.fake_server import QuietHandler, serving
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 from tests.support.servers import S3Server
@@ -45,26 +45,19 @@ class FullS3(ThreadingHTTPServer):
         return S3Store(S3Server(endpoint, "someone", "a secret", False, None).bucket("placewise"))
 
 
-class Refuses(BaseHTTPRequestHandler):
+class Refuses(QuietHandler):
     server: FullS3
     protocol_version = "HTTP/1.1"
 
     def answer(self) -> None:
         self.rfile.read(int(self.headers.get("Content-Length") or 0))
-        self.send_response(self.server.status)
-        self.send_header("Content-Type", "application/xml")
-        self.send_header("Content-Length", str(len(self.server.body)))
-        self.end_headers()
-        self.wfile.write(self.server.body)
+        self.reply(self.server.status, self.server.body, {"Content-Type": "application/xml"})
 
     do_PUT = do_POST = answer  # noqa: N815
 
-    def do_DELETE(self) -> None:
+    def do_DELETE(self) -> None:  # noqa: N802
         self.send_response(204)
         self.end_headers()
-
-    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
-        """Keep the test's output clean."""
 
 
 REFUSALS = [
@@ -85,12 +78,8 @@ def refusal(request: pytest.FixtureRequest) -> tuple[int, str, str, int]:
 
 @pytest.fixture
 def full(refusal: tuple[int, str, str, int]) -> Iterator[S3Store]:
-    with FullS3(*refusal[:2]) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
+    with FullS3(*refusal[:2]) as server, serving(server):
         yield server.store()
-        server.shutdown()
-        thread.join()
 
 
 @pytest.mark.parametrize("size", [1000, 12 * MEGABYTE], ids=["one request", "parts"])

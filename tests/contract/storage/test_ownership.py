@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import shutil
-import threading
 from collections.abc import Callable, Iterator
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from uuid import UUID
 
@@ -14,7 +14,6 @@ from sqlalchemy import select
 
 from shared.catalog.database.session import Catalog
 from shared.catalog.installation import (
-    Installation,
     adopt_store,
     check_before_new_catalog,
     get_or_create_installation,
@@ -26,12 +25,12 @@ from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.ids import new_id
 from shared.storage import ObjectStore, OwnedStore
-from shared.storage.keys import OWNER_MARK
 from shared.storage.open_store import open_store
 from shared.storage.ownership import read_owner
 from shared.storage.s3 import Bucket, S3Store
 from tests.support.catalog_rows import add_map, upload
 from tests.support.servers import S3Server
+from tests.support.threads import at_once
 
 
 @pytest.fixture
@@ -73,39 +72,10 @@ def copied(source: Bucket, target: Bucket) -> None:
         S3Store(target).put(info.key, S3Store(source).get(info.key))
 
 
-def test_an_installation_has_a_permanent_and_unique_id(
-    catalog: Catalog, other_catalog: Catalog
-) -> None:
-    ids = set()
-    for one in (catalog, catalog, other_catalog):
-        with one.write() as session:
-            ids.add(get_or_create_installation(session).id)
-            assert len(session.scalars(select(Installation)).all()) == 1
-    assert len(ids) == 2
-
-
-def test_an_empty_bucket_is_claimed_and_opened_again(
-    started: Started, catalog: Catalog, bucket: Bucket
-) -> None:
-    started(catalog, bucket).put("originals/a", b"x")
-    started(catalog, bucket)
-    with catalog.read() as session:
-        owner = get_or_create_installation(session).id
-    assert S3Store(bucket).get(OWNER_MARK).decode() == str(owner)
-
-
 def test_services_that_start_together_agree_on_the_bucket(
     started: Started, catalog: Catalog, bucket: Bucket
 ) -> None:
-    opened: list[ObjectStore] = []
-    threads = [
-        threading.Thread(target=lambda: opened.append(started(catalog, bucket))) for _ in range(4)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(opened) == 4
+    at_once(*[partial(started, catalog, bucket)] * 4)
 
 
 def test_a_bucket_with_foreign_objects_is_refused_and_unchanged(
@@ -226,21 +196,15 @@ def test_two_catalogs_that_start_together_never_share_a_folder(
     catalog: Catalog, other_catalog: Catalog, tmp_path: Path
 ) -> None:
     settings = Settings(placewise_home=tmp_path / "home")
-    barrier, outcomes = threading.Barrier(2), list[str]()
 
-    def start(one: Catalog) -> None:
-        barrier.wait()
+    def start(one: Catalog) -> str:
         try:
             open_installation_store(one, settings, exclusive=False)
-            outcomes.append("owner")
         except Misconfigured as error:
-            outcomes.append(error.code)
+            return error.code
+        return "owner"
 
-    threads = [threading.Thread(target=start, args=(one,)) for one in (catalog, other_catalog)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    outcomes = at_once(partial(start, catalog), partial(start, other_catalog))
     assert sorted(outcomes) == ["folder_taken", "owner"]
 
 

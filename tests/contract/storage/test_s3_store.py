@@ -12,10 +12,8 @@ from typing import Any
 
 import pytest
 from minio.lifecycleconfig import LifecycleConfig
-from typer.testing import CliRunner
 from urllib3.exceptions import ProtocolError
 
-from services.cli.main import build_app
 from shared.config.settings import Settings
 from shared.errors import Misconfigured, Unavailable
 from shared.storage import FolderStore, ObjectStore
@@ -23,6 +21,7 @@ from shared.storage.open_store import open_store
 from shared.storage.s3 import Bucket, S3Store, create_bucket
 from shared.storage.s3.streams import PART_BYTES
 from tests.support.clock import clock_off_by
+from tests.support.commands import run
 from tests.support.servers import S3Server
 
 
@@ -246,19 +245,13 @@ def test_command_makes_the_bucket_and_is_content_with_one(
     name = f"{bucket.name}-cli"
     for variable, value in s3.variables(name).items():
         monkeypatch.setenv(variable.upper(), str(value))
-    results = [
-        CliRunner().invoke(build_app(["storage"]), ["storage", "create-bucket"]) for _ in range(2)
-    ]
-    assert [result.exit_code for result in results] == [0, 0]
-    assert "was created" in results[0].stdout
-    assert "already exists" in results[1].stdout
+    assert "was created" in run("storage", "create-bucket").stdout
+    assert "already exists" in run("storage", "create-bucket").stdout
     S3Store(s3.bucket(name)).check()
 
 
 def test_command_without_an_endpoint_says_what_to_set() -> None:
-    result = CliRunner().invoke(build_app(["storage"]), ["storage", "create-bucket"])
-    assert result.exit_code == 1
-    assert "S3_ENDPOINT" in result.output
+    assert "S3_ENDPOINT" in run("storage", "create-bucket", code=1).output
 
 
 # --- which store ------------------------------------------------------------------------------

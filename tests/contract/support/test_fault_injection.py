@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import http.server
-import threading
 from collections.abc import Iterator
+from http.server import ThreadingHTTPServer
 
 import httpx2
 import pytest
 from redis import Redis
 
 from shared.jobs.wakeups import WakeupQueue
+from tests.support.fake_server import QuietHandler, serving
 from tests.support.fault_injection import FaultProxy, MessageDuplicator, ProxyMode
 from tests.support.servers import start_redis
 from tests.support.servers.daemon import free_ports
@@ -18,39 +18,26 @@ from tests.support.servers.daemon import free_ports
 BODY = bytes(range(256)) * 40
 
 
-class Echo(http.server.BaseHTTPRequestHandler):
+class Echo(QuietHandler):
     """Answers with what it was sent."""
 
     protocol_version = "HTTP/1.1"
 
-    def do_PUT(self) -> None:
+    def do_PUT(self) -> None:  # noqa: N802
         body = self.rfile.read(int(self.headers["Content-Length"]))
-        self.send_response(200)
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body)
+        self.reply(200, body, {})
 
-    def do_GET(self) -> None:
-        self.send_response(200)
-        if self.close_connection:  # as S3 servers say it: the client is not to use it again
-            self.send_header("Connection", "close")
-        self.send_header("Content-Length", str(len(BODY)))
-        self.end_headers()
-        self.wfile.write(BODY)
-
-    def log_message(self, *_: object) -> None: ...
+    def do_GET(self) -> None:  # noqa: N802
+        # As S3 servers say it: the client is not to use it again.
+        self.reply(200, BODY, {"Connection": "close"} if self.close_connection else {})
 
 
 @pytest.fixture
 def proxy() -> Iterator[FaultProxy]:
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Echo) as server:
+    with ThreadingHTTPServer(("127.0.0.1", 0), Echo) as server:
         server.daemon_threads = True
-        serving = threading.Thread(target=server.serve_forever)
-        serving.start()
-        with FaultProxy(free_ports(1)[0], server.server_port) as started:
+        with serving(server), FaultProxy(free_ports(1)[0], server.server_port) as started:
             yield started
-        server.shutdown()
-        serving.join()
 
 
 @pytest.fixture

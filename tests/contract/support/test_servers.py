@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -29,6 +28,7 @@ from tests.support.servers import (
     start_s3,
 )
 from tests.support.servers.daemon import Daemon, has_ended
+from tests.support.waiting import wait_until
 
 pytestmark = pytest.mark.servers
 
@@ -120,7 +120,4 @@ def test_servers_end_with_tests_that_are_killed() -> None:
         server = psutil.Process(int(pid))
         assert server.is_running()
         tests.send_signal(signal.SIGKILL)
-    deadline = time.monotonic() + GONE_SECONDS
-    while not has_ended(server) or Path(folder).exists():
-        assert time.monotonic() < deadline, "the server or its folder is still there"
-        time.sleep(0.05)
+    wait_until(lambda: has_ended(server) and not Path(folder).exists(), GONE_SECONDS)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,14 +34,6 @@ def before_describing(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[...
 
 
 Hook = Callable[[Callable[..., None]], None]
-
-
-@pytest.fixture
-def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where DINO_WEIGHTS points; nothing lies there yet."""
-    path = tmp_path / "dinov2_vits14_pretrain.pth"
-    monkeypatch.setenv("DINO_WEIGHTS", str(path))
-    return path
 
 
 @pytest.fixture

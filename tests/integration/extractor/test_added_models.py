@@ -19,7 +19,6 @@ from sqlalchemy import select, update
 from services.extractor import model_changes
 from services.extractor.worker import ExtractorWorker
 from services.steward.tasks.garbage_collection import collect_checkpoints
-from services.steward.tasks.model_changes import advance_model_changes
 from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import get_map
@@ -28,7 +27,6 @@ from shared.descriptors.backbones import normalise_pixels
 from shared.descriptors.backbones.torchhub import module_fingerprint
 from shared.imaging.decode import decode_photo
 from shared.imaging.preprocessing import get_preprocessing
-from shared.jobs import InProcessWakeups
 from shared.storage.keys import CHECKPOINTS, MODELS
 from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import end_pauses, stored_rows
@@ -62,27 +60,10 @@ def send(service: Service, data: bytes, name: str = "walks", **fields: str) -> h
     )
 
 
-def ended(service: Service, answer: httpx2.Response, map_name: str = "default") -> Any:
-    """The job that the answer names, once it has ended."""
-    assert answer.status_code == 202, answer.text
-    for _ in range(20):
-        service.drain()
-        advance_model_changes(service.catalog, InProcessWakeups())
-        job = service.json("GET", f"/jobs/{answer.json()['job_id']}", params={"map": map_name})
-        if job["state"] not in ("queued", "running"):
-            return job
-    raise AssertionError(f"the job did not end: {job}")
-
-
-def done(service: Service, answer: httpx2.Response, map_name: str = "default") -> Any:
-    job = ended(service, answer, map_name)
-    assert job["state"] == "succeeded", job
-    return job["result"]
-
-
 def failed(service: Service, answer: httpx2.Response, code: str) -> str:
     """The reason for which the job has failed."""
-    job = ended(service, answer)
+    assert answer.status_code == 202, answer.text
+    job = service.ended(answer.json()["job_id"])
     assert (job["state"], job["error"]["code"]) == ("failed", code), job
     return str(job["error"]["detail"])
 
@@ -105,7 +86,7 @@ def active(service: Service, map_name: str = "default") -> Generation:
 @pytest.fixture
 def walks(service: Service) -> Service:
     """With the model `walks`, and PHOTOS photos in the map `default`, which another describes."""
-    done(service, send(service, some_checkpoint(), licence="CC BY 4.0", note="of spring"))
+    service.done(send(service, some_checkpoint(), licence="CC BY 4.0", note="of spring"))
     service.indexed(*range(PHOTOS))
     return service
 
@@ -116,7 +97,7 @@ def walks(service: Service) -> Service:
 def test_a_checkpoint_becomes_a_model_without_what_training_goes_on_with(service: Service) -> None:
     model = untrained()
     data = checkpoint_of(model, city="Genova", rate=float("nan"), long_text="a\x00b")
-    result = done(service, send(service, data, licence="CC BY 4.0"))
+    result = service.done(send(service, data, licence="CC BY 4.0"))
     body = service.json("GET", "/models/walks")
     (stored,) = keys(service, MODELS)
     assert result == {
@@ -150,7 +131,7 @@ def test_the_same_weights_again_are_fine_and_others_under_the_name_are_refused(
 ) -> None:
     before = walks.json("GET", "/models/walks")
     trained_on = checkpoint_of(untrained(), lr_of_the_day=1)  # another file, the same weights
-    assert done(walks, send(walks, trained_on, note="once more"))["already_there"]
+    assert walks.done(send(walks, trained_on, note="once more"))["already_there"]
     after = walks.json("GET", "/models/walks")
     assert {**after, "note": "of spring"} == before
     assert after["note"] == "once more"
@@ -159,8 +140,7 @@ def test_the_same_weights_again_are_fine_and_others_under_the_name_are_refused(
     assert before["fingerprint"][:12] in reason
     assert walks.json("GET", "/models/walks") == after
     assert (
-        done(walks, send(walks, some_checkpoint(1), "other"))["fingerprint"]
-        != before["fingerprint"]
+        walks.done(send(walks, some_checkpoint(1), "other"))["fingerprint"] != before["fingerprint"]
     )
     assert [m["name"] for m in walks.json("GET", "/models")["models"]] == ["other", "walks"]
 
@@ -237,7 +217,7 @@ def test_an_uploaded_checkpoint_is_kept_until_its_job_has_ended(service: Service
     collect_checkpoints(service.catalog, service.store)
     collect_orphans(service.catalog, service.store, 0)
     assert len(keys(service, CHECKPOINTS)) == 1
-    done(service, started)
+    service.done(started)
     collect_orphans(service.catalog, service.store, 0)
     assert (len(keys(service, CHECKPOINTS)), len(keys(service, MODELS))) == (0, 1)
 
@@ -292,7 +272,7 @@ def test_a_map_is_described_as_the_model_itself_describes(walks: Service) -> Non
 
 def test_a_map_that_has_no_photo_yet_takes_the_model_at_once(walks: Service) -> None:
     walks.json("POST", "/maps", 201, json={"name": "empty", "extractor": "test-tiny-vlad"})
-    done(walks, switch(walks, "empty", extractor="gsv:walks"), "empty")
+    walks.done(switch(walks, "empty", extractor="gsv:walks"), "empty")
     assert walks.json("GET", "/maps/empty")["extractor"] == "gsv:walks"
     walks.indexed(1, map_name="empty")
     assert active(walks, "empty").dimension == 128
@@ -323,12 +303,14 @@ def test_photos_wait_for_a_model_that_is_not_there_yet(walks: Service) -> None:
     assert (waits["state"], waits["error"]["code"]) == ("queued", "model_missing")
     body = walks.json("GET", f"/jobs/{response}")
     assert (body["state"], body["error"]["code"]) == ("failed", "model_missing")
+    assert walks.worker.state()["errors"] == {"gsv:nights": "model_missing"}
 
-    done(walks, send(walks, some_checkpoint(1), "nights"))
+    walks.done(send(walks, some_checkpoint(1), "nights"))
     end_pauses(walks.catalog)
     walks.drain()
     assert walks.json("GET", f"/jobs/{job_id}")["state"] == "succeeded"
     assert active(walks).extractor == "gsv:nights"
+    assert walks.worker.state()["errors"] == {}
 
 
 def test_a_model_file_with_another_hash_describes_nothing(walks: Service) -> None:
@@ -344,9 +326,9 @@ def test_a_model_file_with_another_hash_describes_nothing(walks: Service) -> Non
     assert (waits["state"], waits["error"]["code"]) == ("running", "model_corrupt")
 
     # As the reason says: the same checkpoint again repairs it.
-    done(walks, send(walks, some_checkpoint()))
+    walks.done(send(walks, some_checkpoint()))
     end_pauses(walks.catalog)
-    assert done(walks, job)["dimension"] == 128
+    assert walks.done(job)["dimension"] == 128
 
 
 # --- removing --------------------------------------------------------------------------------
@@ -363,13 +345,13 @@ def test_a_model_that_a_map_or_the_settings_use_is_not_removed(walks: Service) -
     started = switch(walks, extractor="gsv:walks")
     walks.drain()  # its generation is being built
     assert problem(walks("DELETE", "/models/walks"), 409, "model_in_use")["maps"] == ["default"]
-    done(walks, started)
+    walks.done(started)
     assert problem(walks("DELETE", "/models/walks"), 409, "model_in_use")["maps"] == ["default"]
 
 
 def test_a_removed_model_goes_with_its_bytes_and_its_name_means_no_other(walks: Service) -> None:
-    done(walks, switch(walks, extractor="gsv:walks"))
-    done(walks, switch(walks, extractor="test-tiny-avg"))
+    walks.done(switch(walks, extractor="gsv:walks"))
+    walks.done(switch(walks, extractor="test-tiny-avg"))
     assert walks.json("DELETE", "/models/walks")["removed_model"] == "walks"
     problem(walks("GET", "/models/walks"), 404, "model_missing")
     problem(walks("DELETE", "/models/walks"), 404, "model_missing")
@@ -379,8 +361,8 @@ def test_a_removed_model_goes_with_its_bytes_and_its_name_means_no_other(walks: 
 
     reason = failed(walks, send(walks, some_checkpoint(1)), "model_name_taken")
     assert "names are not reused" in reason
-    assert not done(walks, send(walks, some_checkpoint()))["already_there"]
-    assert done(walks, switch(walks, extractor="gsv:walks"))["dimension"] == 128
+    assert not walks.done(send(walks, some_checkpoint()))["already_there"]
+    assert walks.done(switch(walks, extractor="gsv:walks"))["dimension"] == 128
 
 
 def test_a_model_that_is_removed_at_the_last_moment_begins_no_generation(
@@ -429,7 +411,7 @@ def test_torchscript_code_runs_only_where_its_hash_is_allowed(
     data = tiny_torchscript()
     reason = failed(service, send_exported(service, data, "net.pt"), "code_not_allowed")
     assert code_name(data) in reason
-    added = done(allowing, send_exported(allowing, data, "net.pt"))
+    added = allowing.done(send_exported(allowing, data, "net.pt"))
     assert added["extractor"] == f"torchscript:tiny:{SIZE}"
     assert added["fingerprint"] == hashlib.sha256(data).hexdigest()
     # Another worker may have been started without it.
@@ -446,7 +428,7 @@ def test_an_exported_network_is_listed_used_kept_and_removed(
     allowing: Service, tmp_path: Path
 ) -> None:
     data = onnx_of(tiny_network(), tmp_path)
-    extractor = done(allowing, send_exported(allowing, data, "net.onnx"))["extractor"]
+    extractor = allowing.done(send_exported(allowing, data, "net.onnx"))["extractor"]
     (body,) = allowing.json("GET", "/models")["models"]
     assert (body["name"], body["extractor"]) == ("tiny", extractor)
     assert (body["dimension"], body["image_size"]) == (DIMENSION, [SIDE, SIDE])
@@ -457,7 +439,7 @@ def test_an_exported_network_is_listed_used_kept_and_removed(
     problem(switch(allowing, extractor=f"torchscript:tiny:{SIZE}"), 404, "model_missing")
     problem(switch(allowing, extractor="gsv:tiny"), 404, "model_missing")
     ids = allowing.indexed(*range(PHOTOS))
-    done(allowing, switch(allowing, extractor=extractor))
+    allowing.done(switch(allowing, extractor=extractor))
     generation = active(allowing)
     assert generation.spec["backbone_fingerprint"] == hashlib.sha256(data).hexdigest()
     rows = stored_rows(allowing.catalog, allowing.store, generation.id)
@@ -469,7 +451,7 @@ def test_an_exported_network_is_listed_used_kept_and_removed(
         np.testing.assert_allclose(rows[UUID(photo_id)], expected, rtol=2**-10, atol=1e-5)
     used = problem(allowing("DELETE", "/models/tiny"), 409, "model_in_use")
     assert used["maps"] == ["default"]
-    done(allowing, switch(allowing, extractor="test-tiny-avg"))
+    allowing.done(switch(allowing, extractor="test-tiny-avg"))
     allowing.json("DELETE", "/models/tiny")
 
 
@@ -479,7 +461,7 @@ def test_patches_of_an_exported_network_get_a_vocabulary_of_the_map(
     options = f"aggregator=vlad,clusters=4,{SIZE}"
     data = onnx_of(tiny_network(patches=True), tmp_path)
     started = send_exported(allowing, data, "net.onnx", "town", options)
-    extractor = done(allowing, started)["extractor"]
+    extractor = allowing.done(started)["extractor"]
     allowing.json("POST", "/maps", 201, json={"name": "town", "extractor": extractor})
     allowing.indexed(*range(3 * PHOTOS), map_name="town")
     pooled = active(allowing, "town")
@@ -488,26 +470,11 @@ def test_patches_of_an_exported_network_get_a_vocabulary_of_the_map(
         PATCH_WIDTH,
     )
     fitted = allowing("POST", "/vocabularies", params={"map": "town"}, json={})
-    clusters = done(allowing, fitted, "town")["clusters"]
+    clusters = allowing.done(fitted, "town")["clusters"]
     generation = active(allowing, "town")
     assert clusters > 1
     assert (generation.extractor, generation.dimension) == (extractor, clusters * PATCH_WIDTH)
     assert allowing.json("GET", "/models/town")["maps"] == ["town"]
-
-
-@pytest.mark.parametrize(
-    ("data", "file", "code"),
-    [
-        (b"no network", "net.onnx", "model_unusable"),
-        (tiny_torchscript()[:-400], "net.pt", "checkpoint_unreadable"),
-    ],
-)
-def test_a_file_that_is_no_network_for_photos_fails_and_leaves_nothing(
-    allowing: Service, data: bytes, file: str, code: str
-) -> None:
-    failed(allowing, send_exported(allowing, data, file), code)
-    assert keys(allowing, MODELS) == []
-    assert allowing.json("GET", "/models")["models"] == []
 
 
 def test_options_that_no_network_has_fail_with_those_that_exist(service: Service) -> None:

@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 from uuid import UUID
 
@@ -34,6 +35,7 @@ from tests.integration.extractor.conftest import Hook
 from tests.integration.harness import Harness, expected_row, once, same
 from tests.support.catalog_rows import problem_of, set_columns
 from tests.support.photos import encoded, photo_bytes, photo_image
+from tests.support.threads import at_once
 
 
 def test_each_photo_has_one_descriptor_row_that_is_its_own(averages: Harness) -> None:
@@ -109,11 +111,7 @@ def test_two_workers_at_once_describe_each_photo_once(
 ) -> None:
     photo_ids = averages.upload(*range(16))
     workers = [make_worker(), make_worker()]
-    threads = [threading.Thread(target=w.drain, args=[threading.Event()]) for w in workers]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    at_once(*(partial(worker.drain, threading.Event()) for worker in workers))
     assert set(averages.rows()) == set(photo_ids)
     with averages.catalog.read() as session:
         assert session.scalar(select(func.sum(Chunk.rows))) == 16

@@ -22,23 +22,20 @@ from shared.jobs.model_changes import start_reindex
 from shared.jobs.runner import reclaim_expired_leases
 from shared.matching.features import LocalFeatures
 from shared.matching.mutual_nearest import match_keypoints
-from shared.matching.verification import verify_matches
 from shared.storage.chunks import features_key
 from shared.storage.feature_files import read_feature_index, read_feature_rows
 from shared.storage.keys import query_features_key
 from tests.integration.harness import Harness
-from tests.support.catalog_rows import read_job, set_columns
+from tests.support.catalog_rows import problem_of, read_job, set_columns
 from tests.support.photos import encoded, photo_bytes, turned_photo
 
 TO_GEM = {"vocabulary_id": None, "extractor": "test-tiny-vlad:aggregator=gem"}
 
 
-def textured(number: int, size: tuple[int, int] = (400, 300)) -> Image.Image:
+def textured(number: int) -> Image.Image:
     """A photo full of corners: random blocks of 8 pixels."""
-    width, height = size
-    blocks = np.random.default_rng(number).integers(0, 256, (height // 8 + 1, width // 8 + 1, 3))
-    large = np.kron(blocks.astype(np.uint8), np.ones((8, 8, 1), np.uint8))
-    return Image.fromarray(large[:height, :width])
+    blocks = np.random.default_rng(number).integers(0, 256, (38, 50, 3))
+    return Image.fromarray(np.kron(blocks.astype(np.uint8), np.ones((8, 8, 1), np.uint8)))
 
 
 def texture_bytes(number: int) -> bytes:
@@ -108,35 +105,6 @@ def test_photos_get_features_in_pixels_of_the_upright_photo(harness: Harness) ->
     assert len(pairs) > 100
     points = first.pixels()[pairs[:, 0]], second.pixels()[pairs[:, 1]]
     np.testing.assert_allclose(*points, atol=0.5)
-
-
-def test_shifted_copy_of_a_photo_matches_it_and_another_photo_does_not(harness: Harness) -> None:
-    scene = textured(1, (800, 600))
-    views = [scene.crop((x, 0, x + 640, 600)) for x in (0, 80)]
-    photos = [harness.upload_bytes(encoded(view, "JPEG"))[0] for view in (*views, textured(2))]
-    harness.drain()
-    found = features_of(harness)
-
-    def inliers(one: UUID, other: UUID) -> int:
-        first, second = found[one], found[other]
-        assert first is not None
-        assert second is not None
-        pairs = match_keypoints(first, second)
-        points = first.working_pixels()[pairs[:, 0]], second.working_pixels()[pairs[:, 1]]
-        return int(verify_matches(*points).sum())
-
-    same_place = inliers(photos[0], photos[1])
-    assert same_place > max(100, 4 * inliers(photos[0], photos[2]))
-
-
-def test_photo_of_8_pixels_and_one_without_texture_have_features_without_keypoints(
-    harness: Harness,
-) -> None:
-    tiny, _ = harness.upload_bytes(encoded(Image.new("RGB", (8, 8), "red"), "PNG"))
-    flat, _ = harness.upload_bytes(encoded(Image.new("RGB", (640, 480), "red"), "PNG"))
-    harness.drain()
-    assert keypoints(harness) == {tiny: 0, flat: 0}
-    assert harness.searchable() == 2
 
 
 @pytest.mark.parametrize("decided", [None, True, False])
@@ -327,6 +295,5 @@ def test_missing_weights_of_local_features_stop_photos_and_not_queries(
     assert harness.job(query).state == JobState.SUCCEEDED
     job = harness.job(job_id)
     assert job.state == JobState.QUEUED
-    assert job.error is not None
-    assert job.error["code"] == "weights_missing"
+    assert problem_of(job)["code"] == "weights_missing"
     assert harness.worker.state()["errors"] == {"xfeat": "weights_missing"}

@@ -29,7 +29,7 @@ from shared.storage.chunks import Rows, decode_rows, read_row
 from shared.storage.keys import WHITENINGS, query_vector_key
 from tests.integration.conftest import LentDecoders
 from tests.integration.harness import Harness, expected_row, same
-from tests.support.catalog_rows import failure_code
+from tests.support.catalog_rows import failure_code, result_of
 from tests.support.checkpoints import none_added
 from tests.support.photos import photo_bytes
 
@@ -55,8 +55,8 @@ def reduced(described: Harness) -> Harness:
     return described
 
 
-def reduce(harness: Harness, pca: int = KEPT) -> Job:
-    job = harness.finish(harness.start(JobKind.PCA, pca=pca))
+def reduce(harness: Harness) -> Job:
+    job = harness.finish(harness.start(JobKind.PCA, pca=KEPT))
     assert job.state == JobState.SUCCEEDED, job.error
     return job
 
@@ -126,8 +126,7 @@ def test_stored_rows_are_whitened_without_a_photo(
     for photo_id, row in rows.items():
         assert same(row, projected(expected, before[photo_id]))
         assert np.linalg.norm(row) == pytest.approx(1, abs=1e-5)
-    assert job.result is not None
-    assert job.result["pca"] == {
+    assert result_of(job)["pca"] == {
         "from_dimension": old.dimension,
         "dimension": KEPT,
         "rows": PHOTOS,
@@ -241,9 +240,7 @@ def test_switching_off_pca_describes_full_dimension_again(described: Harness) ->
     before, old = described.rows(), described.active()
     reduce(described)
     job = described.finish(described.start(JobKind.SWITCH, vocabulary_id=None))
-    assert job.state == JobState.SUCCEEDED
-    assert job.result is not None
-    assert job.result["pca"] is None
+    assert result_of(job)["pca"] is None
     assert described.active().spec == old.spec
     assert described.active().whitening_id is None
     assert all(same(row, before[photo_id]) for photo_id, row in described.rows().items())
@@ -277,16 +274,6 @@ def test_a_pca_fit_on_too_few_photos_or_to_too_many_dimensions_fails(described: 
     assert described.active().id == before
 
 
-def test_photos_that_are_all_alike_are_refused_when_their_rows_are_known(
-    averages: Harness,
-) -> None:
-    for number in range(PHOTOS):  # other bytes, the same pixels
-        averages.upload_bytes(photo_bytes(1) + bytes([number]))
-    averages.drain()
-    job = averages.finish(averages.start(JobKind.PCA, pca=2))
-    assert failure_code(job) == "pca_too_many_dimensions"
-
-
 def test_a_whitening_is_not_fitted_on_rows_of_another_release(
     described: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -296,18 +283,6 @@ def test_a_whitening_is_not_fitted_on_rows_of_another_release(
 
 def test_a_map_without_descriptors_is_refused(averages: Harness) -> None:
     assert failure_code(averages.finish(averages.start(JobKind.PCA, pca=3))) == "nothing_described"
-
-
-def test_a_cancelled_pca_changes_nothing(described: Harness) -> None:
-    before = described.active().id
-    job_id = described.start(JobKind.PCA, pca=KEPT)
-    described.drain()
-    building = described.building()
-    assert building is not None
-    assert building.whitening_id is not None
-    described.cancel(job_id)
-    described.advance()
-    assert (described.active().id, described.building()) == (before, None)
 
 
 # --- what is left of it ----------------------------------------------------------------------

@@ -2,32 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from uuid import UUID
 
 import pytest
 from sqlalchemy import select
 
 from services.extractor.generation_resolver import reindex_outdated_generations
-from shared.catalog.database.session import Catalog
-from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import Map
 from shared.catalog.vocabularies import vocabulary_standing
-from shared.config.settings import Settings
 from shared.jobs import Job, JobKind, JobState
 from tests.integration.extractor.model_changes import import_file, npy, some_centres
 from tests.integration.harness import Harness, expected_row, same
-from tests.integration.in_process_api import Service
 from tests.support.photos import photo_bytes
-from tests.support.vit import random_weights, save
 
 VLAD = "test-tiny-vlad"
 POOLED = "test-tiny-vlad:aggregator=gem"
-
-
-@pytest.fixture
-def settings(weights: Path) -> Settings:
-    return Settings()
 
 
 @pytest.fixture
@@ -64,25 +53,6 @@ def test_the_first_photo_is_described_by_pooling_the_same_local_features(
     assert pooled.job(query).state == JobState.SUCCEEDED
 
 
-@pytest.mark.usefixtures("fit_at_four_photos")
-def test_with_enough_photos_a_vocabulary_is_fitted_while_the_pooled_descriptors_answer(
-    pooled: Harness,
-) -> None:
-    photo_ids = pooled.upload(4)
-    pooled.drain()
-    (fit,) = pooled.fit_if_due()
-
-    def answers_meanwhile() -> None:
-        if pooled.job(fit).state in UNFINISHED_STATES:
-            assert extractors(pooled) == (VLAD, POOLED, "pending")
-            assert pooled.searchable() == 5
-
-    assert pooled.finish(fit, answers_meanwhile).state == JobState.SUCCEEDED
-    assert extractors(pooled) == (VLAD, VLAD, "provisional")
-    assert pooled.searchable() == 5
-    assert len(pooled.rows()[photo_ids[0]]) == 16 * pooled.active().spec["clusters"]
-
-
 def test_an_imported_vocabulary_ends_the_pooling(pooled: Harness) -> None:
     job = import_file(pooled, npy(some_centres(1)))
     assert pooled.finish(job).state == JobState.SUCCEEDED
@@ -114,20 +84,3 @@ def test_switching_to_the_pooling_extractor_by_name_is_no_waiting_for_a_vocabula
     assert pooled.finish(job).state == JobState.SUCCEEDED
     assert extractors(pooled) == (POOLED, POOLED, "none")
     assert pooled.fit_if_due() == []
-
-
-def test_a_dinov2_map_answers_from_its_first_photo_and_says_that_its_vocabulary_is_pending(
-    service: Service, catalog: Catalog, weights: Path
-) -> None:
-    from shared.descriptors.backbones.dinov2 import SHAPES
-
-    save(random_weights(SHAPES["vits14"], blocks=1), weights)
-    extractor = "anyloc-vits14:clusters=2,layer=0"
-    service.json("POST", "/maps", 201, json={"name": "city", "extractor": extractor})
-    first, _ = service.indexed(1, 2, map_name="city")
-    answer = service.json("POST", f"/similarity/{first}", params={"map": "city"})
-    assert answer["vocabulary"] == "pending"
-    assert len(answer["similar_images"]) == 1
-    stats = service.json("GET", "/database/stats", params={"map": "city"})
-    assert (stats["vocabulary"], stats["feature_dimension"]) == ("pending", 384)
-    assert service.json("GET", "/maps/city")["extractor"] == extractor

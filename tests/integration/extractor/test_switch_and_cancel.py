@@ -72,7 +72,7 @@ def test_a_stopping_worker_requeues_its_fit(
         patched.setattr(fits, "compute_fit", stop_and_fit)
         fitted.worker.fits.run_next(stop)
     job = fitted.job(job_id)
-    assert (job.lease_token, job.attempts) == (None, 0)
+    assert (job.state, job.lease_token, job.attempts) == (JobState.RUNNING, None, 0)
     assert fitted.finish(job_id).state == JobState.SUCCEEDED
 
 

@@ -26,7 +26,6 @@ from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.vocabulary import decode_centres
-from shared.descriptors.vocabulary_fit import PATCHES_PER_CLUSTER
 from shared.integrity.verify import discard_chunk
 from shared.jobs import Job, JobKind, JobState, progress
 from shared.jobs.progress import JobProgress
@@ -41,7 +40,7 @@ from tests.integration.extractor.model_changes import (
     some_centres,
 )
 from tests.integration.harness import FIT, Harness, expected_row, same
-from tests.support.catalog_rows import failure_code, problem_of
+from tests.support.catalog_rows import failure_code, problem_of, result_of
 from tests.support.photos import photo_bytes
 
 pytestmark = pytest.mark.numerics
@@ -96,18 +95,6 @@ def test_a_fit_replaces_the_generation_while_the_old_one_answers(fitted: Harness
 def _version(harness: Harness) -> int:
     with harness.catalog.read() as session:
         return session.get_one(Map, harness.map_id).version
-
-
-def test_few_photos_give_few_clusters(vlads: Harness) -> None:
-    vlads.upload(1, 2, 3)
-    job = vlads.fit(clusters=64)
-    assert job.result is not None
-    assert job.result["clusters"] == 3 * 64 // PATCHES_PER_CLUSTER == 3
-    generation = vlads.active()
-    assert (generation.dimension, generation.spec["clusters"]) == (3 * WIDTH, 3)
-    provenance = vlads.vocabulary(generation.vocabulary_id).provenance
-    assert (provenance["clusters_asked"], provenance["patches"]) == (64, 3 * 64)
-    assert (provenance["photos"], provenance["seed"]) == (3, 0)
 
 
 def test_a_fit_that_names_no_number_makes_as_many_clusters_as_the_extractors_name_says(
@@ -279,10 +266,8 @@ def test_a_model_change_does_not_wait_for_deleted_photos(fitted: Harness) -> Non
     fitted.drain()
     fitted.delete(rest[0])  # described
     fitted.advance()
-    job = fitted.job(job_id)
-    assert job.state == JobState.SUCCEEDED
-    assert job.result is not None
-    assert (job.result["photos"], job.result["failed"]) == (PHOTOS - 3, 0)
+    result = result_of(fitted.job(job_id))
+    assert (result["photos"], result["failed"]) == (PHOTOS - 3, 0)
     assert fitted.active().id == new
     assert set(fitted.rows(new)) == set(rest)
 
@@ -312,9 +297,8 @@ def test_a_photo_that_fails_in_the_new_generation_is_recorded_and_blocks_nothing
     bad, *good = photo_ids(fitted)
     spoil(fitted, bad)
     job = fitted.finish(job_id)
-    assert job.state == JobState.SUCCEEDED
-    assert job.result is not None
-    assert (job.result["photos"], job.result["failed"]) == (PHOTOS - 1, 1)
+    result = result_of(job)
+    assert (result["photos"], result["failed"]) == (PHOTOS - 1, 1)
     assert (job.progress_failed, job.progress_done) == (1, job.progress_total - 1)
     assert fitted.active().id == new
     assert set(fitted.rows()) == set(good)

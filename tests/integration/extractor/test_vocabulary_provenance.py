@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from shared.catalog.vocabularies import Vocabulary
 from shared.descriptors.extractor import Extractor, choose_device
-from shared.descriptors.vocabulary import decode_centres, encode_centres, parse_centres
-from shared.descriptors.vocabulary_file import Provenance, VocabularyFile, feature_provenance
+from shared.descriptors.vocabulary import encode_centres, parse_centres
+from shared.descriptors.vocabulary_file import Provenance, feature_provenance
 from shared.extractor_config.configs import get_extractor_config
 from shared.imaging import preprocessing
 from shared.jobs import JobKind, JobState
@@ -23,13 +22,6 @@ from tests.support.catalog_rows import failure_code, problem_of
 def tiny_features() -> Provenance:
     config = get_extractor_config("test-tiny-vlad", allow_test_extractors=True)
     return feature_provenance(Extractor(config, choose_device("cpu")))
-
-
-def vocabulary_file(**provenance: Any) -> bytes:
-    """Five centres in a file, fitted with the tiny features by default."""
-    centres = parse_centres(np.random.default_rng(3).standard_normal((5, WIDTH)).astype(np.float32))
-    fields = {**tiny_features(), "photos": 40, "sha256": centres.sha256, **provenance}
-    return VocabularyFile(centres, fields).encode()
 
 
 def active_vocabulary(harness: Harness) -> Vocabulary:
@@ -55,22 +47,6 @@ def test_a_fitted_vocabulary_says_what_it_was_fitted_on(vlads: Harness) -> None:
     }
     assert 0 < cosine < 1
     assert 10 < passes <= 20
-
-
-def test_an_imported_vocabulary_keeps_what_its_file_says(vlads: Harness) -> None:
-    vlads.upload(1)
-    job = vlads.finish(import_file(vlads, vocabulary_file(note="Turin"), "turin.npz"))
-    assert job.state == JobState.SUCCEEDED
-    found = active_vocabulary(vlads)
-    assert (found.origin, found.standing, found.clusters) == ("imported", "foreign", 5)
-    assert found.provenance == {
-        **tiny_features(),
-        "photos": 40,
-        "sha256": found.sha256,
-        "note": "Turin",
-        "imported_from": "turin.npz",
-    }
-    assert decode_centres(vlads.store.get(found.object_key)).sha256 == found.sha256
 
 
 def test_after_another_version_of_the_preprocessing_only_what_may_fit_is_switched_to(

@@ -139,19 +139,6 @@ def test_a_full_queue_refuses_no_answer_that_makes_no_job(make_service: Make) ->
     service.json("POST", "/maps", 201, json={"name": "empty"})
 
 
-@pytest.mark.usefixtures("always_look")
-def test_a_call_that_a_full_queue_refused_is_accepted_under_its_key_once_there_is_room(
-    make_service: Make,
-) -> None:
-    service = make_service(max_queued_jobs=1)
-    upload(service, 1)
-    key = {"Idempotency-Key": "k"}
-    queue_full(service("POST", "/upload", files={"file": photo_bytes(2)}, headers=key))
-    service.drain()
-    answer = service("POST", "/upload", files={"file": photo_bytes(2)}, headers=key)
-    assert (answer.status_code, "idempotent-replayed" in answer.headers) == (202, False)
-
-
 def test_the_queue_is_counted_up_to_a_limit_without_jobs_that_no_worker_could_claim(
     catalog: Catalog,
 ) -> None:

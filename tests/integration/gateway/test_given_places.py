@@ -7,10 +7,9 @@ from typing import Any
 
 import pytest
 from PIL import Image
-from PIL.ExifTags import IFD, Base
 
 from tests.integration.in_process_api import Service
-from tests.support.photos import photo_bytes
+from tests.support.photos import camera_exif, photo_bytes
 from tests.support.problems import problem
 
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
@@ -18,15 +17,8 @@ NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
 
 def taken(seconds: float, camera: str = "X100", offset: str | None = "+02:00") -> Image.Exif:
     """The EXIF of a photo so many seconds after noon UTC; the camera's clock is two hours ahead."""
-    exif = Image.Exif()
-    exif[Base.Model] = camera
-    tags = exif.get_ifd(IFD.Exif)
-    tags[Base.BodySerialNumber] = "1"
     clock = NOON + timedelta(hours=2, seconds=seconds)
-    tags[Base.DateTimeOriginal] = f"{clock:%Y:%m:%d %H:%M:%S}"
-    if offset:
-        tags[Base.OffsetTimeOriginal] = offset
-    return exif
+    return camera_exif(clock, offset=offset, model=camera, serial="1")
 
 
 def stored(service: Service, number: int, exif: Image.Exif | None = None, **fields: Any) -> str:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 from uuid import UUID
 
-import pytest
 from sqlalchemy import update
 
 from shared.catalog.database.base import db_now_plus
-from shared.catalog.maps import get_map
 from shared.catalog.processes import RegisteredProcess, process_heartbeat
 from shared.jobs import Job
 from shared.storage.trash import end_hold, write_hold
@@ -146,42 +143,3 @@ def test_extractors_are_degraded_while_a_job_waits_much_longer_than_usual(
     assert part["status"] == "degraded"
     assert "waited for 36" in part["detail"]
     assert "usual" in part["detail"]
-
-
-@pytest.fixture
-def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The path of DINO_WEIGHTS, where no file exists yet; before the settings are read."""
-    path = tmp_path / "dinov2_vits14_pretrain.pth"
-    monkeypatch.setenv("DINO_WEIGHTS", str(path))
-    return path
-
-
-def test_a_worker_reports_missing_weights_until_the_model_is_loaded(
-    weights: Path, service: Service
-) -> None:
-    from shared.descriptors.backbones.dinov2 import SHAPES
-    from tests.support.vit import random_weights, save
-
-    with service.catalog.write() as session:
-        get_map(session, "default").extractor = ANYLOC
-    uploaded = service.upload(photo_bytes(1))
-    service.drain()
-    state = service.worker.state()
-    assert (state["device"], state["models"]) == ("cpu", [])
-    assert state["errors"] == {ANYLOC: "weights_missing"}
-    assert "DINO_WEIGHTS" in state["error_details"][ANYLOC], "what to do"
-    waited = service.json(
-        "POST",
-        "/upload",
-        202,
-        files={"file": ("photo.jpg", photo_bytes(1))},
-        headers={"Prefer": "wait=0.1"},
-    )
-    assert waited["job_id"] == uploaded["job_id"]
-    assert "Describing it failed" in waited["message"], waited["message"]
-
-    save(random_weights(SHAPES["vits14"], blocks=1), weights)
-    set_columns(service.catalog, UUID(uploaded["job_id"]), run_after=None)
-    service.drain()
-    assert service.worker.state()["errors"] == {}
-    assert ANYLOC in service.worker.state()["models"]

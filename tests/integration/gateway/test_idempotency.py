@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import httpx2
@@ -24,6 +24,7 @@ from tests.integration.api_with_keys import Door
 from tests.integration.in_process_api import Service
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import field_refused, problem
+from tests.support.threads import at_once
 
 pytestmark = pytest.mark.databases("postgresql")
 
@@ -248,14 +249,7 @@ def test_the_same_call_at_two_gateways_at_once_has_one_effect(
     service.indexed(1, latitude=45, longitude=7)
     jobs, photos = count(catalog, Job), count(catalog, Photo)
     gateways = [service, Service(catalog, store, settings, make_worker)]
-    together = threading.Barrier(8)
-
-    def one(number: int) -> httpx2.Response:
-        together.wait(timeout=30)
-        return make(gateways[number % 2], headers=keyed())
-
-    with ThreadPoolExecutor(8) as pool:
-        answers = list(pool.map(one, range(8)))
+    answers = at_once(*(partial(make, each, headers=keyed()) for each in gateways * 4))
     assert sum(REPLAYED not in answer.headers for answer in answers) == 1
     assert len({answer.text for answer in answers}) == 1
     made = {call_upload: (1, 1), call_evaluation: (1, 0), call_map: (0, 0)}[make]

@@ -13,8 +13,7 @@ from services.steward.tasks.compaction import merge_small_chunks
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole
 from shared.config.settings import Settings
-from shared.jobs import JobKind, JobState
-from tests.integration.harness import FIT, Harness
+from tests.integration.harness import Harness
 from tests.integration.in_process_api import Service
 from tests.support.photos import near_copy, photo_bytes
 
@@ -82,16 +81,6 @@ def test_waiting_queries_do_not_make_a_map_fit_a_vocabulary(vlads: Harness) -> N
     vlads.upload(6)
     vlads.drain()
     assert len(vlads.fit_if_due()) == 1
-
-
-def test_a_fit_of_queries_alone_says_that_there_is_nothing_to_learn_from(
-    vlads: Harness,
-) -> None:
-    become(vlads, PhotoRole.QUERY, *vlads.upload(0, 1))
-    job = vlads.finish(vlads.start(JobKind.FIT, **FIT))
-    assert job.state == JobState.FAILED
-    assert job.error is not None
-    assert job.error["code"] == "no_photos"
 
 
 def test_a_role_is_set_at_upload_and_changed_later(service: Service) -> None:

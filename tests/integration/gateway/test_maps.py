@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import threading
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,6 @@ from services.steward.evaluation_worker import EvaluationWorker
 from services.steward.tasks import delete_maps
 from services.steward.tasks.compaction import merge_small_chunks
 from services.steward.tasks.delete_maps import purge_deleted_maps
-from services.steward.tasks.model_changes import advance_model_changes
 from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk
@@ -28,7 +27,7 @@ from shared.catalog.maps import cache_map_statistics
 from shared.catalog.photos import Photo
 from shared.config.settings import Settings
 from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT
-from shared.jobs import InProcessWakeups, Job, JobKind
+from shared.jobs import Job, JobKind
 from shared.storage import FolderStore
 from shared.storage.keys import new_checkpoint_key
 from tests.integration.gateway.deleted_maps import ROUNDS, id_of, objects, remove_all, rows
@@ -37,6 +36,7 @@ from tests.support.catalog_rows import add_job, add_photo, add_reconstruction
 from tests.support.checkpoints import none_added
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
+from tests.support.threads import at_once
 
 pytestmark = pytest.mark.databases("postgresql")
 
@@ -55,8 +55,7 @@ def live_in(service: Service, name: str) -> None:
         service.upload(photo_bytes(number), name, latitude=number, longitude=7)
     service.upload(photo_bytes(4), name, role="query", place="hall")
     service.upload(photo_bytes(5)[:-60], name)  # it can't be decoded
-    service.json("POST", "/vocabularies", 202, params=params, json={"clusters": 4})
-    finish_changes(service)
+    service.done(service("POST", "/vocabularies", params=params, json={"clusters": 4}), name)
     oldest = service.json("GET", "/search", params={**params, "role": "database"})["images"][-1]
     service.json("DELETE", f"/uploads/{oldest['image_id']}", params=params)
     found = service.json("GET", "/search", params={**params, "role": "query"})["images"]
@@ -66,10 +65,10 @@ def live_in(service: Service, name: str) -> None:
     service.json("POST", "/evaluations", 202, params=params)
     evaluator = EvaluationWorker(service.catalog, service.search, settings, "evaluator")
     assert evaluator.run_next(threading.Event())
-    service.json("POST", "/vocabularies", 202, params=params, json={"clusters": 3, "seed": 5})
-    finish_changes(service)
-    service.json("POST", "/generations", 202, params=params, json={"pca": 1})
-    finish_changes(service)
+    service.done(
+        service("POST", "/vocabularies", params=params, json={"clusters": 3, "seed": 5}), name
+    )
+    service.done(service("POST", "/generations", params=params, json={"pca": 1}), name)
     with service.catalog.write() as session:
         cache_map_statistics(session, id_of(service, name))
     buffer = io.BytesIO()
@@ -94,12 +93,6 @@ def live_in(service: Service, name: str) -> None:
         service.store.put(job.params["object_key"], b"a COLMAP model")
 
 
-def finish_changes(service: Service) -> None:
-    for _ in range(8):
-        service.drain()
-        advance_model_changes(service.catalog, InProcessWakeups())
-
-
 def test_choosing_a_vocabulary_switches_automatic_fits_off(service: Service) -> None:
     service.json("POST", "/maps", 201, json={"name": "quay", "extractor": "test-tiny-vlad"})
     made = service.json("GET", "/maps/quay")
@@ -107,13 +100,11 @@ def test_choosing_a_vocabulary_switches_automatic_fits_off(service: Service) -> 
     service.indexed(1, 2, map_name="quay")
     params = {"map": "quay"}
     for seed in (0, 1):
-        service.json("POST", "/vocabularies", 202, params=params, json={"seed": seed})
-        finish_changes(service)
+        service.done(service("POST", "/vocabularies", params=params, json={"seed": seed}), "quay")
     _, oldest = service.json("GET", "/vocabularies", params=params)
     assert service.json("GET", "/maps/quay")["auto_fit"] is True
     body = {"vocabulary_id": oldest["vocabulary_id"]}
-    service.json("POST", "/generations", 202, params=params, json=body)
-    finish_changes(service)
+    service.done(service("POST", "/generations", params=params, json=body), "quay")
     chosen = service.json("GET", "/maps/quay")
     assert (chosen["auto_fit"], chosen["next_fit_photos"]) == (False, None)
     again = service.json("PATCH", "/maps/quay", json={"auto_fit": True})
@@ -137,7 +128,7 @@ def test_matching_on_starts_a_model_change_where_photos_have_no_local_features(
     assert changed["model_change_id"] is not None
     again = service("PATCH", "/maps/quay", json={"matching": "on"})
     problem(again, 409, "model_change_running")
-    finish_changes(service)
+    service.ended(changed["model_change_id"], "quay")
     after = service.json("GET", "/maps/quay")
     assert after["generation_id"] != before["generation_id"]
     assert after["local_features"]["photos"] == 2
@@ -221,8 +212,7 @@ def test_a_deleted_default_map_is_created_again_empty(
 @pytest.mark.databases("sqlite", "postgresql")
 def test_concurrent_deletions_delete_a_map_once(service: Service) -> None:
     service.json("POST", "/maps", 201, json={"name": "town"})
-    with ThreadPoolExecutor(4) as pool:
-        answers = list(pool.map(lambda _: service("DELETE", "/maps/town").status_code, range(4)))
+    answers = at_once(*[lambda: service("DELETE", "/maps/town").status_code] * 4)
     assert set(answers) <= {200, 404}
     assert 200 in answers
     service.json("POST", "/maps", 201, json={"name": "town"})
@@ -230,11 +220,8 @@ def test_concurrent_deletions_delete_a_map_once(service: Service) -> None:
 
 @pytest.mark.databases("sqlite", "postgresql")
 def test_concurrent_creations_create_a_map_once(service: Service) -> None:
-    def make(_: int) -> int:
-        return service("POST", "/maps", json={"name": "town"}).status_code
-
-    with ThreadPoolExecutor(4) as pool:
-        assert sorted(pool.map(make, range(4))) == [201, 409, 409, 409]
+    answers = at_once(*[lambda: service("POST", "/maps", json={"name": "town"}).status_code] * 4)
+    assert sorted(answers) == [201, 409, 409, 409]
 
 
 # --- removing --------------------------------------------------------------------------------
@@ -307,9 +294,7 @@ def test_two_stewards_remove_a_map_together(
     before = rows(catalog)
     live_in(service, "gone")
     service.json("DELETE", "/maps/gone")
-    with ThreadPoolExecutor(2) as pool:
-        for removal in [pool.submit(remove_all, catalog, store) for _ in range(2)]:
-            removal.result()
+    at_once(*[partial(remove_all, catalog, store)] * 2)
     assert rows(catalog) == before
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 from uuid import UUID
 
@@ -28,6 +27,7 @@ from tests.integration.in_process_api import Service
 from tests.support.catalog_rows import add_job, add_photo, read_job, states
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
+from tests.support.threads import at_once
 
 pytestmark = pytest.mark.databases("postgresql")
 
@@ -132,10 +132,8 @@ def test_uploads_while_their_map_is_deleted_are_refused_or_go_with_it(
     service.json("POST", "/maps", 201, json={"name": "gone"})
     service.make_worker()
     before = rows(catalog)
-    together = threading.Barrier(5)
 
     def upload(number: int) -> int:
-        together.wait()
         answers = [
             service(
                 "POST",
@@ -149,16 +147,13 @@ def test_uploads_while_their_map_is_deleted_are_refused_or_go_with_it(
             answer.status_code not in (202, 404) for answer in answers
         )
 
-    def delete() -> None:
-        together.wait()
+    def delete() -> int:
         service.json("DELETE", "/maps/gone")
         remove_all(catalog, store)
+        return 0
 
-    with ThreadPoolExecutor(5) as pool:
-        uploads = [pool.submit(upload, number) for number in range(4)]
-        deleting = pool.submit(delete)
-        deleting.result()
-        assert all(0 <= task.result() <= 4 for task in uploads)
+    taken = at_once(delete, *(partial(upload, number) for number in range(4)))
+    assert all(0 <= each <= 4 for each in taken)
     remove_all(catalog, store)
     assert objects(store) == set()
     assert rows(catalog) == Counter({**before, "maps": before["maps"] - 1})

@@ -8,10 +8,8 @@ from uuid import uuid4
 import httpx2
 import pytest
 
-from services.steward.tasks.model_changes import advance_model_changes
 from shared.catalog.vocabularies import Vocabulary
 from shared.descriptors.vocabulary_file import decode_vocabulary
-from shared.jobs import InProcessWakeups
 from tests.integration.in_process_api import Service
 from tests.support.problems import field_refused, problem
 
@@ -23,7 +21,7 @@ def vlad(service: Service) -> Service:
     """A map `vlad` of PHOTOS photos with a vocabulary of two centres: 32 dimensions."""
     service.json("POST", "/maps", 201, json={"name": "vlad", "extractor": "test-tiny-vlad"})
     service.indexed(*range(PHOTOS), map_name="vlad")
-    done(service, post(service, "/vocabularies", {"clusters": 2}))
+    service.done(post(service, "/vocabularies", {"clusters": 2}), "vlad")
     return service
 
 
@@ -33,19 +31,6 @@ def post(service: Service, path: str, body: Any) -> httpx2.Response:
 
 def get(service: Service, path: str) -> Any:
     return service.json("GET", path, params={"map": "vlad"})
-
-
-def done(service: Service, answer: httpx2.Response) -> Any:
-    """The result of the model change."""
-    assert answer.status_code == 202, answer.text
-    for _ in range(20):
-        service.drain()
-        advance_model_changes(service.catalog, InProcessWakeups())
-        job = get(service, f"/jobs/{answer.json()['job_id']}")
-        if job["state"] not in ("queued", "running"):
-            assert job["state"] == "succeeded", job
-            return job["result"]
-    raise AssertionError("the model change did not end")
 
 
 def active(service: Service) -> Any:
@@ -58,7 +43,7 @@ def test_an_impossible_pca_is_refused_at_once(vlad: Service) -> None:
     field_refused(post(vlad, "/generations", {"pca": 0}), "pca")
     field_refused(post(vlad, "/generations", {"pca": 1025}), "pca")
     first = active(vlad)["vocabulary_id"]
-    done(vlad, post(vlad, "/vocabularies", {"clusters": 3}))
+    vlad.done(post(vlad, "/vocabularies", {"clusters": 3}), "vlad")
     other = post(vlad, "/generations", {"pca": 3, "vocabulary_id": first})
     field_refused(other, "vocabulary_id")
     vlad.json("POST", "/maps", 201, json={"name": "empty"})

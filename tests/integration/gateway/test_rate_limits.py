@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from threading import Barrier, Event
 from types import SimpleNamespace
@@ -30,6 +29,7 @@ from tests.integration.api_with_keys import ADMIN, Door
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 from tests.support.servers import RedisServer, start_redis
+from tests.support.threads import at_once
 
 
 @pytest.fixture(autouse=True)
@@ -175,8 +175,7 @@ def test_parallel_uploads_store_exactly_as_many_photos_as_the_key_may(
 
     monkeypatch.setattr(uploads_module, "validate_photo", examine_together)
     key = door.key("write", max_photos=most)["key"]
-    with ThreadPoolExecutor(uploads) as pool:
-        answers = list(pool.map(partial(door.put, key), range(uploads)))
+    answers = at_once(*(partial(door.put, key, number) for number in range(uploads)))
     codes = Counter(answer.status_code for answer in answers)
     assert codes == {202: most, 429: uploads - most}
     with door.catalog.read() as session:

@@ -9,8 +9,6 @@ from typing import Any
 
 import httpx2
 
-from services.steward.tasks.model_changes import advance_model_changes
-from shared.jobs import InProcessWakeups
 from tests.integration.in_process_api import API, Service
 from tests.support.photos import encoded, photo_bytes, photo_image
 from tools.make_api_page import openapi_description
@@ -86,16 +84,6 @@ class Followed:
             allowed = {200, 409} if unfinished else {200, 202} if "/frames/" in url else {200}
             assert found.status_code in allowed, f"{operation}: {url}: {found.text}"
 
-    def until_it_ends(self, started: dict[str, Any]) -> None:
-        for _ in range(60):
-            self.service.drain()
-            advance_model_changes(self.service.catalog, InProcessWakeups())
-            job = self.service.json("GET", started["status_url"].removeprefix(API))
-            if job["state"] not in ("queued", "running"):
-                assert job["state"] == "succeeded", job
-                return
-        raise AssertionError(f"the job did not end: {job}")
-
     def cancel(self, started: dict[str, Any]) -> None:
         self("cancel_job", "POST", f"/jobs/{started['job_id']}/cancel")
 
@@ -108,7 +96,7 @@ def test_every_url_in_an_answer_leads_to_its_map(service: Service) -> None:
         fields = {"place": f"room {number // 2}", "captured_at": f"2026-01-0{number}T12:00:00Z"}
         uploaded = call("upload", "POST", "/upload", files=photo, data=fields)
     fitted = call("fit_vocabulary", "POST", "/vocabularies", json={"clusters": 4})
-    call.until_it_ends(fitted)
+    assert service.ended(fitted["job_id"], MAP)["state"] == "succeeded"
     file_id, job_id = uploaded["file_id"], uploaded["job_id"]
 
     call("list_jobs", "GET", "/jobs")
@@ -123,7 +111,7 @@ def test_every_url_in_an_answer_leads_to_its_map(service: Service) -> None:
     call("similar_to_stored", "POST", f"/similarity/{file_id}")
     query = {"file": ("query.jpg", photo_bytes(5))}
     searched = call("similar_to_upload", "POST", "/similarity", files=query)
-    call.until_it_ends(searched)
+    assert service.ended(searched["job_id"], MAP)["state"] == "succeeded"
     call("similarity_result", "GET", f"/jobs/{searched['job_id']}/result")
 
     track = (

@@ -8,10 +8,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 from uuid import UUID
 
-import hypothesis
 import pytest
-from hypothesis import HealthCheck
-from hypothesis import strategies as st
 from sqlalchemy import func, select, update
 
 from services.gateway.tracks import apply_frames
@@ -422,55 +419,20 @@ def test_invalid_fields_are_refused_by_name_and_leave_nothing(service: Service) 
     problem(service("GET", path), 404, "frame_not_found")
 
 
-TIMES = st.datetimes(timezones=st.just(UTC)).map(datetime.isoformat)
-METRES = st.floats(0, 1e6, exclude_min=True)
-ODOMETRY = st.fixed_dictionaries(
-    {"distance_m": st.floats(0, 1e6), "distance_accuracy_m": METRES},
-    optional={"turn_degrees": st.floats(-360, 360)},
-)
-FIX = st.fixed_dictionaries(
-    {
-        "latitude": st.floats(-90, 90),
-        "longitude": st.floats(-180, 180),
-        "accuracy_m": st.floats(1e-3, 1e5),
-    }
-)
-FRAMES = st.lists(
-    st.tuples(TIMES, st.one_of(st.just({}), ODOMETRY, FIX)),
-    min_size=2,
-    max_size=3,
-    unique_by=lambda frame: frame[0],
-)
-
-
-def test_any_times_and_odometry_lead_to_a_state(
-    street: Service, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    photo = photo_bytes(0)
-
-    @hypothesis.given(frames=FRAMES)
-    @hypothesis.settings(
-        max_examples=8, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck)
-    )
-    def check(frames: Any) -> None:
-        track_id = begin(street)
-        for time, fields in frames:
-            street.json(
-                "POST",
-                f"/tracks/{track_id}/frames",
-                202,
-                data={"captured_at": time, **{name: repr(v) for name, v in fields.items()}},
-                files={"file": ("frame.jpg", photo)},
-            )
-        street.drain()
-        for smoothed in (False, True):
-            track = read(street, track_id, smoothed=smoothed)
-            assert [f["status"] for f in track["frames"]] == ["applied"] * len(frames)
-            for frame in track["frames"]:
-                assert 0 <= frame["state"]["probability"] <= 1
-                assert 0 <= frame["state"]["not_in_map_probability"] <= 1
-
-    check()
+def test_frames_of_any_times_and_with_any_odometry_lead_to_a_state(street: Service) -> None:
+    track_id = begin(street)
+    jump: dict[str, Any] = {"distance_m": 1e6, "distance_accuracy_m": 5e-324, "turn_degrees": -360}
+    pole: dict[str, Any] = {"latitude": -90, "longitude": 180, "accuracy_m": 1e5}
+    times = ("0001-01-01T00:00:00Z", time_of(0), "9999-12-31T23:59:59.999999Z")
+    for time, fields in zip(times, ({}, jump, pole), strict=True):
+        send(street, track_id, 0, captured_at=time, **fields)
+    street.drain()
+    for smoothed in (False, True):
+        frames = read(street, track_id, smoothed=smoothed)["frames"]
+        assert [frame["status"] for frame in frames] == ["applied"] * 3
+        for state in (frame["state"] for frame in frames):
+            assert 0 <= state["probability"] <= 1
+            assert 0 <= state["not_in_map_probability"] <= 1
 
 
 def test_a_full_track_takes_no_more(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:

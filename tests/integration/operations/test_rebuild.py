@@ -9,7 +9,6 @@ from functools import partial
 from typing import Any
 from uuid import UUID, uuid4
 
-import numpy as np
 import pytest
 from sqlalchemy import delete, func, select
 
@@ -48,7 +47,7 @@ from shared.storage.keys import JOURNAL, ORIGINALS
 from shared.storage.ownership import read_owner
 from shared.storage.segments import list_segments
 from tests.integration.in_process_api import Service
-from tests.support.catalog_rows import add_job, add_reconstruction, stored_rows
+from tests.support.catalog_rows import add_job, add_reconstruction
 from tests.support.photos import photo_bytes
 
 pytestmark = pytest.mark.databases("postgresql")
@@ -96,16 +95,15 @@ def answers(service: Service, file_id: str, map_name: str = "default") -> Any:
 def two_maps(service: Service) -> dict[str, str]:
     """Photos of two maps of two extractors, a labelled query, one that was patched and one in the
     trash: the map of each that is left."""
-    service.json("POST", "/maps", 201, json={"name": "halls", "extractor": "test-tiny-vlad"})
+    halls_map = {"name": "halls", "extractor": "test-tiny-vlad", "rows": "float16"}
+    service.json("POST", "/maps", 201, json=halls_map)
     first, second, gone = service.indexed(1, 2, 3, **SAID)
     nowhere = {"place": "bridge", "latitude": None, "longitude": None}
     service.json("PATCH", f"/uploads/{second}", json=nowhere)
     (query,) = service.indexed(4, role="query", place="tower")
     halls = [service.upload(photo_bytes(n), "halls")["file_id"] for n in (1, 5, 6)]
-    service.json("POST", "/vocabularies", 202, params={"map": "halls"}, json={"clusters": 4})
-    for _ in range(20):
-        service.drain()
-        advance_model_changes(service.catalog, InProcessWakeups())
+    fit = service("POST", "/vocabularies", params={"map": "halls"}, json={"clusters": 4})
+    service.done(fit, "halls")
     service.json("DELETE", f"/uploads/{gone}")
     return dict.fromkeys((first, second, query), "default") | dict.fromkeys(halls, "halls")
 
@@ -120,6 +118,8 @@ def test_every_photo_is_searchable_again_with_its_metadata(
     service.json("PATCH", "/maps/halls", json={"matching": "on"})
     matched = [(m["matching"], m["local_features"]) for m in service.json("GET", "/maps")]
     assert [features["photos"] for _, features in matched] == [4, 3]
+    rows = [each["rows"] for each in service.json("GET", "/generations", params={"map": "halls"})]
+    assert set(rows) == {"float16"}
     service.json("POST", "/maps", 201, json={"name": "gone"})
     service.indexed(9, map_name="gone")
     service.json("DELETE", "/maps/gone")
@@ -152,6 +152,8 @@ def test_every_photo_is_searchable_again_with_its_metadata(
     maps = service.json("GET", "/maps")
     assert [m["name"] for m in maps] == ["default", "halls"]
     assert [(m["matching"], m["local_features"]) for m in maps] == matched
+    generations = service.json("GET", "/generations", params={"map": "halls"})
+    assert [each["rows"] for each in generations] == rows
     # It goes on: new photos come into the same generations, and the journal too.
     (new,) = service.indexed(7, map_name="halls")
     assert answers(service, new, "halls")
@@ -177,21 +179,6 @@ def test_a_finished_reconstruction_comes_back_and_one_that_was_deleted_does_not(
     with service.catalog.read() as session:
         found = session.scalars(select(Reconstruction)).one()
         assert (found.id, found.list_components()) == (kept.id, kept.list_components())
-
-
-def test_a_map_with_float16_rows_goes_on_with_them(service: Service, store: FolderStore) -> None:
-    service.json("POST", "/maps", 201, json={"name": "half", "rows": "float16"})
-    photos = service.indexed(1, 2, 3, map_name="half")
-    before = [answers(service, photo_id, "half") for photo_id in photos]
-    write_journal(service.catalog, store)
-    lose_catalog(service.catalog)
-    service, _ = rebuilt(service)
-    assert [answers(service, photo_id, "half") for photo_id in photos] == before
-    service.indexed(4, map_name="half")
-    (generation,) = service.json("GET", "/generations", params={"map": "half"})
-    assert generation["rows"] == "float16"
-    rows = stored_rows(service.catalog, store, UUID(generation["generation_id"]))
-    assert [row.dtype for row in rows.values()] == 4 * [np.dtype(np.float16)]
 
 
 class DyingStore:
@@ -307,11 +294,7 @@ def test_a_model_change_of_a_snapshot_that_nothing_follows_is_finished(
     lose_catalog(service.catalog)
     service, report = rebuilt(service)
     assert report.descriptors == 7 + 3
-    for _ in range(5):
-        service.drain()
-        service.search.sync()
-        advance_model_changes(service.catalog, InProcessWakeups())
-    assert service.json("GET", f"/jobs/{job_id}", params={"map": "halls"})["state"] == "succeeded"
+    assert service.ended(job_id, "halls")["state"] == "succeeded"
     with service.catalog.read() as session:
         assert session.get_one(Generation, generation_id).state == GenerationState.ACTIVE
     in_halls = [file_id for file_id, name in left.items() if name == "halls"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -15,6 +16,7 @@ from shared.catalog.database.schema import check_schema, migrate, wait_for_schem
 from shared.catalog.database.session import Catalog, PoolConfig, TransactionTimeouts
 from shared.errors import Misconfigured, Unavailable
 from tests.support.servers import PostgresServer
+from tests.support.threads import at_once
 
 
 @pytest.fixture
@@ -25,20 +27,7 @@ def catalog(postgres: PostgresServer) -> Iterator[Catalog]:
 
 
 def test_processes_that_migrate_at_once_create_the_tables_once(catalog: Catalog) -> None:
-    failed: list[Exception] = []
-
-    def run() -> None:
-        try:
-            migrate(catalog)
-        except Exception as error:
-            failed.append(error)
-
-    threads = [threading.Thread(target=run) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(timeout=60)
-    assert not failed
+    at_once(*[partial(migrate, catalog)] * 4)
     check_schema(catalog)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from uuid import UUID
 
 import pytest
-from sqlalchemy import delete, func, select
+from sqlalchemy import delete, select
 
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.base import Base
@@ -144,26 +144,6 @@ def test_a_changed_original_is_found_by_its_hash_and_a_missing_one_without(
     report = looked(service, originals=True)
     assert faults(report) == {("missing", "original"), ("damaged", "original")}
     assert mend(service, report) == 0
-
-
-def test_a_generation_that_is_being_built_gets_its_lost_rows_again(vlads: Harness) -> None:
-    vlads.upload(*range(10))
-    vlads.fit()
-    job_id, building = vlads.build(seed=1)
-    vlads.advance()
-    vlads.drain()
-    with vlads.catalog.read() as session:
-        chunk = session.scalars(select(Chunk).where(Chunk.generation_id == building)).first()
-    assert chunk is not None
-    vlads.store.delete(chunk.object_key)
-    report = verify_store(vlads.catalog, vlads.store, originals=False)
-    assert faults(report) == {("missing", "chunk")}
-    assert repair_descriptors(vlads.catalog, InProcessWakeups(), report) > 0
-    assert vlads.finish(job_id).state == "succeeded"
-    with vlads.catalog.read() as session:
-        rows = select(func.count()).select_from(Descriptor)
-        assert session.scalar(rows.where(Descriptor.generation_id == building)) == 10
-    assert verify_store(vlads.catalog, vlads.store, originals=True).faults == []
 
 
 def test_a_changed_vocabulary_is_found(vlads: Harness) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import tarfile
 from typing import Any
 from uuid import UUID
 
@@ -11,11 +9,9 @@ import numpy as np
 import pytest
 
 from services.steward.tasks.compaction import merge_small_chunks
-from services.steward.tasks.model_changes import advance_model_changes
 from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.integrity.verify import verify_store
-from shared.jobs import InProcessWakeups
 from shared.storage import FolderStore
 from tests.integration.conftest import LentDecoders
 from tests.integration.in_process_api import Service
@@ -33,8 +29,8 @@ def half_map(service: Service) -> list[str]:
     ]
 
 
-def generation(service: Service, map_name: str = "half") -> Any:
-    return service.json("GET", "/generations", params={"map": map_name})[0]
+def generation(service: Service) -> Any:
+    return service.json("GET", "/generations", params={"map": "half"})[0]
 
 
 def rows_of(service: Service) -> dict[UUID, Any]:
@@ -89,21 +85,6 @@ def test_uploads_are_searched_by_their_float16_rows_before_and_after_a_merge(
     assert verify_store(service.catalog, store, originals=True).faults == []
 
 
-def test_exported_descriptors_are_the_stored_rows_in_float32(service: Service) -> None:
-    half_map(service)
-    generation_id = generation(service)["generation_id"]
-    path = f"/generations/{generation_id}/descriptors"
-    answer = service("GET", path, params={"map": "half"})
-    assert answer.content.endswith(bytes(2 * tarfile.BLOCKSIZE))
-    with tarfile.open(fileobj=io.BytesIO(answer.content), mode="r:") as tar:
-        file = tar.extractfile("descriptors.npy")
-        assert file is not None
-        exported = np.load(io.BytesIO(file.read()), allow_pickle=False)
-    assert exported.dtype == np.float32
-    stored = np.stack(list(rows_of(service).values()))
-    assert sorted(map(bytes, exported)) == sorted(map(bytes, stored.astype(np.float32)))
-
-
 def test_rows_of_a_map_are_rounded_by_its_next_generation_and_described_again_for_more_precision(
     service: Service, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -124,7 +105,7 @@ def test_rows_of_a_map_are_rounded_by_its_next_generation_and_described_again_fo
 
     with monkeypatch.context() as patched:
         patched.setattr(LentDecoders, "decode", refuse)
-        reindex(service, catalog)
+        reindex(service)
     assert generation(service)["rows"] == "float16"
     rounded = rows_of(service)
     assert {row.dtype for row in rounded.values()} == {np.dtype(np.float16)}
@@ -135,22 +116,17 @@ def test_rows_of_a_map_are_rounded_by_its_next_generation_and_described_again_fo
     np.testing.assert_allclose([s for _, s in after], [s for _, s in before], atol=1e-3)
 
     service.json("PATCH", "/maps/half", json={"rows": "float32"})
-    reindex(service, catalog)
+    reindex(service)
     again = rows_of(service)
     assert all((row == full[photo_id]).all() for photo_id, row in again.items())
     assert {row.dtype for row in again.values()} == {np.dtype(np.float32)}
 
 
-def reindex(service: Service, catalog: Catalog) -> None:
+def reindex(service: Service) -> None:
     """Describe the map `half` into a new generation, and switch to it."""
     service.search.sync()
     before = generation(service)["generation_id"]
-    service.json(
-        "POST", "/generations", 202, params={"map": "half"}, json={"extractor": "test-tiny-avg"}
-    )
-    for _ in range(20):
-        service.drain()
-        service.search.sync()
-        advance_model_changes(catalog, InProcessWakeups())
+    body = {"extractor": "test-tiny-avg"}
+    service.done(service("POST", "/generations", params={"map": "half"}, json=body), "half")
     assert generation(service)["state"] == "active"
     assert generation(service)["generation_id"] != before

@@ -96,13 +96,15 @@ def test_searches_continue_when_a_replica_is_killed_and_it_serves_again_when_it_
 # --- who lags --------------------------------------------------------------------------------
 
 
-def behind(server: SearchServer, monkeypatch: pytest.MonkeyPatch) -> list[SearchRequest]:
-    """Let the worker never reach the requested version; the requests that it gets."""
+def refusing(
+    server: SearchServer, monkeypatch: pytest.MonkeyPatch, code: str = "search_behind"
+) -> list[SearchRequest]:
+    """Let the worker refuse every search; the requests that it gets."""
     requests: list[SearchRequest] = []
 
     def search(request: SearchRequest) -> SearchResponse:
         requests.append(request)
-        raise Unavailable("search_behind", "Search has not caught up.")
+        raise Unavailable(code, "Not now.")
 
     monkeypatch.setattr(server.worker, "search", search)
     return requests
@@ -112,7 +114,7 @@ def test_the_current_replica_answers_while_the_other_is_behind(
     places: SmallMap, tier_of: OpenTier, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tier = tier_of(2)
-    searched = behind(tier.servers[0], monkeypatch)
+    searched = refusing(tier.servers[0], monkeypatch)
     for _ in range(10):
         response = ask(tier, places)
         assert response.missing == ()
@@ -124,7 +126,7 @@ def test_workers_that_all_stay_behind_are_retried_until_the_deadline(
     places: SmallMap, tier_of: OpenTier, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tier = tier_of(1, timeout_seconds=2.0)
-    searched = behind(tier.servers[0], monkeypatch)
+    searched = refusing(tier.servers[0], monkeypatch)
     started = time.monotonic()
     with pytest.raises(Unavailable) as caught:
         ask(tier, places)
@@ -142,6 +144,26 @@ def test_another_worker_answers_for_one_that_hangs(
     for _ in range(4):
         assert_answers(ask(tier, places), places.brute_force(VECTOR, 100))
     released.set()
+
+
+def test_engine_that_does_not_answer_is_reported_as_the_worker_does(
+    places: SmallMap, tier_of: OpenTier, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tier = tier_of(1)
+    refusing(tier.servers[0], monkeypatch, "engine_unavailable")
+    with pytest.raises(Unavailable) as refused:
+        ask(tier, places)
+    assert refused.value.code == "engine_unavailable"
+
+
+def test_a_search_that_begins_when_the_client_is_closed_is_unavailable(
+    places: SmallMap, catalog: Catalog, store: FolderStore, settings: Settings
+) -> None:
+    with SearchTier(catalog, store, settings) as tier:
+        pass
+    with pytest.raises(Unavailable) as refused:
+        ask(tier, places)
+    assert refused.value.code == "search_unavailable"
 
 
 # --- status -----------------------------------------------------------------------------------

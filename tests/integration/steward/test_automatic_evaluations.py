@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from concurrent.futures import ThreadPoolExecutor
-
 import pytest
 
 from services.steward.tasks.auto_evaluation import evaluate_changed_maps
@@ -29,6 +26,7 @@ from tests.support.catalog_rows import (
     read_job,
     set_columns,
 )
+from tests.support.threads import at_once
 
 LEAST = Settings().auto_evaluate_photos
 
@@ -149,16 +147,12 @@ def test_a_new_generation_is_a_change(city: EvaluatedMap) -> None:
 
 def test_two_stewards_queue_one_evaluation(city: EvaluatedMap) -> None:
     city.publish([(n, at(n)) for n in range(LEAST)])
-    together = threading.Barrier(4)
 
     def look() -> None:
-        together.wait()
         for _ in range(3):
             evaluate_changed_maps(city.catalog, Settings())
 
-    with ThreadPoolExecutor(4) as pool:
-        for look_ in [pool.submit(look) for _ in range(4)]:
-            look_.result()
+    at_once(*[look] * 4)
     assert len(city.evaluation_jobs()) == 1
 
 

@@ -181,29 +181,3 @@ def test_deleting_the_job_of_a_batch_deletes_its_items(batches: Batches) -> None
     with batches.catalog.read() as session:
         assert session.scalar(select(func.count()).select_from(BatchItem)) == 0
         assert session.scalar(select(func.count()).select_from(Photo)) == 1
-
-
-def test_objects_of_a_bucket_are_brought_in_across_a_kill(
-    on_s3: Batches, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    photos = files(*range(5))
-    job_id = on_s3.start_import(photos)
-    real = validation.validate_photo
-    left = [3]
-
-    def die_at_the_third(*arguments: Any) -> Any:
-        left[0] -= 1
-        if left[0] == 0:
-            raise Killed
-        return real(*arguments)
-
-    monkeypatch.setattr(worker, "validate_photo", die_at_the_third)
-    with pytest.raises(Killed):
-        on_s3.work()
-    on_s3.worker = restart(on_s3, job_id)
-    on_s3.work()
-    assert on_s3.states(job_id) == ["running"] * 5
-    stored = on_s3.photos()
-    assert [photo.filename for photo in stored] == [name for name, _ in photos]
-    for photo, (_, data) in zip(stored, photos, strict=True):
-        assert on_s3.store.get(photo.object_key) == data

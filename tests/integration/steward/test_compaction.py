@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 from uuid import UUID
 
@@ -25,6 +24,7 @@ from shared.storage.read_retries import ReadRetries
 from tests.integration.harness import same
 from tests.integration.steward.chunk_map import HOUR_SECONDS, ChunkMap, Features
 from tests.support.catalog_rows import row_of, stored_rows
+from tests.support.threads import at_once
 
 pytestmark = pytest.mark.databases("postgresql")
 
@@ -167,9 +167,7 @@ def test_concurrent_compactions_merge_once(
     with chunk_map.catalog.read() as session:
         first_keys = {list_live_chunks(session, chunk_map.generation_id)[0].object_key}
     monkeypatch.setattr(compaction, "read_chunk", read_together)
-    with ThreadPoolExecutor(2) as pool:
-        merges = [pool.submit(chunk_map.merge_all) for _ in range(2)]
-        assert sorted(merge.result() for merge in merges) == [False, True]
+    assert sorted(at_once(*[chunk_map.merge_all] * 2)) == [False, True]
     assert chunk_map.live() == [5]
     chunk_map.check_rows(photo_ids)
 

@@ -17,7 +17,6 @@ from shared.jobs.transitions import cancel_job, retry_job
 from shared.storage import read_retries
 from tests.integration.evaluated_map import EvaluatedMap, Watched
 from tests.integration.in_process_api import Service
-from tests.integration.steward.batches import Killed
 from tests.integration.steward.streets import STREETS, WITHOUT_PLACE
 from tests.support.catalog_rows import add_generation, expire_lease, failure_code, read_job
 from tests.support.photos import photo_bytes
@@ -76,29 +75,6 @@ def test_a_stopping_steward_gives_its_evaluation_to_the_next_one(city: Evaluated
     assert city.evaluations() == []
     assert city.work()
     assert read_job(city.catalog, job_id).state == JobState.SUCCEEDED
-
-
-def kill() -> None:
-    raise Killed
-
-
-def test_a_killed_evaluation_starts_from_the_beginning(city: EvaluatedMap) -> None:
-    city.publish(STREETS)
-    job_id = city.start()
-    with pytest.raises(Killed):
-        city.work(Watched(city.search, 5, kill))
-    assert not city.work(), "its lease is not over"
-    expire_lease(city.catalog, job_id)
-    with city.catalog.write() as session:
-        assert len(reclaim_expired_leases(session)) == 1
-    search = Watched(city.search, 0, kill)
-    assert city.work(search)
-    assert search.searches >= len(STREETS)
-    job = read_job(city.catalog, job_id)
-    assert job.state == JobState.SUCCEEDED
-    assert job.progress_done == job.progress_total == len(STREETS)
-    (evaluation,) = city.evaluations()
-    assert evaluation.figures["leave_one_out"]["R@10"] == 7 / 8
 
 
 def test_an_evaluator_whose_lease_was_taken_over_commits_nothing(city: EvaluatedMap) -> None:

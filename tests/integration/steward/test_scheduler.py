@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from uuid import UUID
 
 import pytest
@@ -37,6 +37,7 @@ from tests.support.catalog_rows import (
     take,
     upload,
 )
+from tests.support.threads import at_once
 
 pytestmark = pytest.mark.databases("postgresql")
 
@@ -51,21 +52,15 @@ def test_concurrent_garbage_collections_are_safe(chunk_map: ChunkMap) -> None:
     ]
     chunk_map.delete(*gone)
     ask(chunk_map.catalog, chunk_map.store, chunk_map.map_id, b"query")
-    together = threading.Barrier(2)
-
-    def both() -> None:
-        together.wait(timeout=30)
-        collect_garbage(
-            chunk_map.catalog,
-            chunk_map.store,
-            query_ttl_seconds=-1.0,
-            superseded_grace_seconds=-1.0,
-            retired_grace_seconds=-1.0,
-        )
-
-    with ThreadPoolExecutor(2) as pool:
-        for done in [pool.submit(both) for _ in range(2)]:
-            done.result()
+    collect = partial(
+        collect_garbage,
+        chunk_map.catalog,
+        chunk_map.store,
+        query_ttl_seconds=-1.0,
+        superseded_grace_seconds=-1.0,
+        retired_grace_seconds=-1.0,
+    )
+    at_once(*[collect] * 2)
     chunk_map.check_rows(retained)
     assert {key.split("/")[0] for key in chunk_map.objects()} == {"chunks", "journal"}
     with chunk_map.catalog.read() as session:

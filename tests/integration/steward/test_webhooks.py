@@ -46,6 +46,7 @@ from tests.integration.steward.webhook_receiver import (
 from tests.support.catalog_rows import end_pauses
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
+from tests.support.waiting import wait_until
 
 pytestmark = pytest.mark.databases("postgresql")
 
@@ -142,17 +143,14 @@ def test_a_retry_is_sent_when_it_is_due_though_nothing_else_happens(
     thread = threading.Thread(target=hooks.sender.run, args=(stop,))
     thread.start()
     try:
-        deadline = time.monotonic() + 60
-        times: list[float] = []
-        while len(times) < 2:
-            assert time.monotonic() < deadline
-            if len(hooks.receiver.messages) > len(times):
-                times.append(time.monotonic())
-            time.sleep(0.05)
+        wait_until(lambda: hooks.receiver.messages, 60)
+        first = time.monotonic()
+        wait_until(lambda: hooks.receiver.messages[1:], 60)
+        between = time.monotonic() - first
     finally:
         stop.set()
         thread.join(timeout=60)
-    assert times[1] - times[0] < IDLE_SECONDS - 5, "not at the next look"
+    assert between < IDLE_SECONDS - 5, "not at the next look"
 
 
 @pytest.fixture
@@ -378,11 +376,7 @@ def test_receivers_that_hang_delay_neither_other_webhooks_nor_the_stop(
             hooks.receiver.url = good
             late = hooks.add("generation.switched")
             hooks.announce(EventKind.GENERATION_SWITCHED)
-            for _ in range(600):
-                if hooks.log(late)[0]["state"] == "delivered":
-                    break
-                time.sleep(0.1)
-            assert hooks.log(late)[0]["state"] == "delivered"
+            wait_until(lambda: hooks.log(late)[0]["state"] == "delivered", 60)
         finally:
             stop.set()
             running.join(60)

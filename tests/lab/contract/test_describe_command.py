@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
-from services.cli.main import build_app
 from shared.descriptors.aggregators.clustering import soft_vlad
 from shared.descriptors.backbones.dinov2 import SHAPES, Dinov2
 from shared.descriptors.backbones.synthetic import TinyBackbone
@@ -23,9 +21,11 @@ from shared.descriptors.extractor import Extractor
 from shared.extractor_config.configs import get_extractor_config
 from shared.imaging.decode import decode_photo
 from shared.imaging.preprocessing import get_preprocessing
+from tests.support.commands import run, run_json
 from tests.support.photos import encoded, photo_image
 from tests.support.vit import random_weights, save
 
+describe = partial(run_json, "describe")
 CPU = torch.device("cpu")
 SIZES = [(64, 48), (48, 64), (64, 48), (90, 70), (64, 48)]
 
@@ -55,26 +55,14 @@ def out(tmp_path: Path) -> Path:
     return folder / "rows.npy"
 
 
-def run(*arguments: object, code: int = 0) -> str:
-    """What the command prints on stdout."""
-    result = CliRunner().invoke(build_app(["describe"]), ["describe", *map(str, arguments)])
-    assert result.exit_code == code, result.output
-    return result.stdout
-
-
-def run_json(*arguments: object, code: int = 0) -> dict[str, Any]:
-    answer: dict[str, Any] = json.loads(run(*arguments, "--json", code=code))
-    return answer
-
-
-def expected(name: str, photos: list[Path], centres: Any = None) -> np.ndarray[Any, Any]:
+def expected(name: str, photos: list[Path]) -> np.ndarray[Any, Any]:
     made = Extractor(get_extractor_config(name, allow_test_extractors=True), CPU)
     pixels = [decode_photo(path.read_bytes(), made.preprocessing, 10**9).pixels for path in photos]
-    return np.stack([made.describe([one], centres)[0] for one in pixels])
+    return np.stack([made.describe([one], None)[0] for one in pixels])
 
 
 def test_rows_are_the_extractors_in_the_order_given(photos: list[Path], out: Path) -> None:
-    answer = run_json(*photos, "--out", out)  # the default extractor
+    answer = describe(*photos, "--out", out)  # the default extractor
     rows = np.load(out)
     assert (rows.dtype, rows.shape) == (np.float32, (5, 16))
     np.testing.assert_allclose(rows, expected("test-tiny-avg", photos), atol=1e-6)
@@ -93,7 +81,7 @@ def test_dinov2_is_described_with_weights_and_vocabulary_from_files(
     weights = save(random_weights(SHAPES["vits14"]), tmp_path / "weights.pth")
     array = np.random.default_rng(0).standard_normal((4, 384)).astype(np.float32)
     torch.save(torch.from_numpy(array), tmp_path / "c_centers.pt")
-    answer = run_json(
+    answer = describe(
         photo, "--out", out, "--weights", weights, "--vocabulary", tmp_path / "c_centers.pt",
         "--extractor",
         "anyloc-vits14:layer=11,facet=key,preprocessing=demo1024,aggregator=soft-vlad",
@@ -118,7 +106,7 @@ def test_every_photo_that_cannot_be_described_is_named_and_nothing_is_written(
     text.write_text("no photo")
     missing = tmp_path / "missing.jpg"
     given = [photos[0], text, photos[1], photos[2], missing, tmp_path, photos[3]]
-    problem = run_json(*given, "--out", out, code=1)
+    problem = describe(*given, "--out", out, code=1)
     assert problem["code"] == "photos_refused"
     assert "3 of 7 photos" in problem["detail"]
     named = [(entry["photo"], entry["code"]) for entry in problem["refused"]]
@@ -129,8 +117,7 @@ def test_every_photo_that_cannot_be_described_is_named_and_nothing_is_written(
     ]
     assert out.read_bytes() == b"what was there before"
     assert [path.name for path in out.parent.iterdir()] == ["rows.npy"]
-    shown = CliRunner().invoke(build_app(["describe"]), ["describe", str(text), "--out", str(out)])
-    assert shown.exit_code == 1
+    shown = run("describe", text, "--out", out, code=1)
     assert "notes [b].jpg: The photo can't be decoded" in shown.stderr
 
 
@@ -145,7 +132,7 @@ def test_descriptor_that_is_not_finite_is_not_written(
         return features
 
     monkeypatch.setattr(TinyBackbone, "features", overflow)
-    problem = run_json(*photos, "--out", out, code=1)
+    problem = describe(*photos, "--out", out, code=1)
     assert problem["code"] == "features_not_finite"
     assert str(photos[0]) in problem["detail"]
     assert list(out.parent.iterdir()) == []
@@ -162,7 +149,7 @@ def test_photo_that_the_gpu_can_not_hold_is_named(
         return real(made, pixels)
 
     monkeypatch.setattr(Extractor, "features", features)
-    problem = run_json(*photos, "--out", out, code=1)
+    problem = describe(*photos, "--out", out, code=1)
     assert problem["code"] == "photos_refused"
     (refused,) = problem["refused"]
     assert (refused["photo"], refused["code"]) == (str(photos[3]), "gpu_out_of_memory")
@@ -177,7 +164,7 @@ def test_interrupted_run_leaves_nothing_behind(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Extractor, "describe", interrupted)
-    run(*photos, "--out", out, code=130)
+    run("describe", *photos, "--out", out, code=130)
     assert list(out.parent.iterdir()) == []
 
 
@@ -200,14 +187,14 @@ def test_contradicting_options_are_refused_before_anything_is_loaded(
     centres = tmp_path / "centres.npy"
     np.save(centres, np.eye(3, 16, dtype=np.float32))
     filled = [argument.format(centres=centres) for argument in arguments]
-    problem = run_json(*photos, "--out", out, *filled, code=1)
+    problem = describe(*photos, "--out", out, *filled, code=1)
     assert problem["code"] == code, problem
     assert message in problem["detail"]
 
 
 def test_folder_that_is_not_there_is_named(photos: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "nowhere" / "rows.npy"
-    problem = run_json(photos[0], "--out", out, code=1)
+    problem = describe(photos[0], "--out", out, code=1)
     assert problem["code"] == "out_unwritable"
     assert str(out) in problem["detail"]
 
@@ -231,7 +218,7 @@ def test_h5_file_holds_hlocs_global_features_by_name(
     photos: list[Path], out: Path, tmp_path: Path
 ) -> None:
     features = out.with_suffix(".h5")
-    run_json(*photos, "--out", features, "--root", tmp_path)
+    describe(*photos, "--out", features, "--root", tmp_path)
     reference = expected("test-tiny-avg", photos)
     with h5py.File(features) as file:
         assert set(file) == {photo.name for photo in photos}
@@ -253,5 +240,5 @@ def test_names_that_an_h5_file_can_not_hold_are_refused(
     photos: list[Path], out: Path, tmp_path: Path, arguments: list[str], code: str
 ) -> None:
     fields = {"photo": photos[0], "out": out.parent, "folder": tmp_path}
-    problem = run_json(*(argument.format(**fields) for argument in arguments), code=1)
+    problem = describe(*(argument.format(**fields) for argument in arguments), code=1)
     assert problem["code"] == code

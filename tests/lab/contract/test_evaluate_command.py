@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from lab.city.plan import CityOptions, make_plan
 from lab.city.write import write_city
@@ -24,13 +23,13 @@ from lab.datasets.open_dataset import open_evaluation_set
 from lab.datasets.utm_coordinates import pairwise_distances_m
 from lab.evaluation.recall import recall_at_k
 from lab.training.describing import ModelDescriber
-from services.cli.main import build_app
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.vpr_models.checkpoint import checkpoint_state, load_checkpoint
 from shared.descriptors.vpr_models.config import VprModelConfig
 from shared.descriptors.vpr_models.model import build_vpr_model
 from shared.extractor_config.configs import get_extractor_config
 from shared.imaging.decode import decode_photo
+from tests.support.commands import run, run_json
 
 CPU = torch.device("cpu")
 
@@ -66,18 +65,6 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("trained") / "gem.ckpt"
     torch.save(checkpoint_state(build_vpr_model(config)), path)
     return path
-
-
-def run(*arguments: object, code: int = 0) -> str:
-    command = str(arguments[0])
-    result = CliRunner().invoke(build_app([command]), list(map(str, arguments)))
-    assert result.exit_code == code, result.output
-    return result.stdout
-
-
-def run_json(*arguments: object, code: int = 0) -> dict[str, Any]:
-    answer: dict[str, Any] = json.loads(run(*arguments, "--json", code=code))
-    return answer
 
 
 def rows_of(shots: Any) -> np.ndarray[Any, np.dtype[np.float32]]:
@@ -321,7 +308,7 @@ def test_rows_that_do_not_fit_the_set_are_refused(
 
 
 def test_people_are_shown_a_table(city: Path) -> None:
-    shown = run("evaluate", "--data", city, "--extractor", "test-tiny-avg")
+    shown = run("evaluate", "--data", city, "--extractor", "test-tiny-avg").stdout
     for part in ("R@1", "all 6 queries", "5 with a positive", "radius 25 m", "certainty", "0.95"):
         assert part in shown
 

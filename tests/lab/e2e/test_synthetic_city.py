@@ -13,41 +13,31 @@ from PIL import Image
 
 from lab.datasets.utm_names import parse_utm_file_name
 from shared.utm_filenames import upload_fields_of_file_name
-from tests.support.server import environment, run_command
+from tests.support.server import CommandLine
 
+SYNTH = ("datasets", "synth")
 SMALL = ("--places", "12", "--queries", "10", "--size", "96x72")
 TINY = ("--places", "3", "--queries", "8", "--size", "64x64")
 NOTE = "generated: not comparable with published figures"
 
 
-class Command:
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.environment = environment(folder / "home")
-
-    def __call__(self, *arguments: str | Path, code: int = 0) -> Any:
-        run = run_command("datasets", "synth", *arguments, env=self.environment, cwd=self.folder)
-        assert run.returncode == code, run.stderr + run.stdout
-        assert "Traceback" not in run.stderr
-        return run
+@pytest.fixture(scope="module")
+def placewise(tmp_path_factory: pytest.TempPathFactory) -> CommandLine:
+    folder = tmp_path_factory.mktemp("city")
+    return CommandLine(folder, folder / "home")
 
 
 @pytest.fixture(scope="module")
-def command(tmp_path_factory: pytest.TempPathFactory) -> Command:
-    return Command(tmp_path_factory.mktemp("city"))
-
-
-@pytest.fixture(scope="module")
-def city(command: Command) -> dict[str, Any]:
+def city(placewise: CommandLine) -> dict[str, Any]:
     """A small city and the output of the command."""
-    answer: dict[str, Any] = json.loads(command("out", *SMALL, "--json").stdout)
+    answer: dict[str, Any] = placewise(*SYNTH, "out", *SMALL, "--json").json()
     return answer
 
 
 @pytest.fixture
-def out(command: Command, city: dict[str, Any]) -> Path:
+def out(placewise: CommandLine, city: dict[str, Any]) -> Path:
     assert city["out"] == "out"
-    return command.folder / "out"
+    return placewise.folder / "out"
 
 
 def contents(folder: Path) -> dict[str, str]:
@@ -111,32 +101,33 @@ def test_gsv_xs_table_names_its_photos_by_place(out: Path) -> None:
 
 
 @pytest.mark.parametrize("option", ["--seed", "--catalogue-seed"])
-def test_another_seed_gives_other_pictures(command: Command, out: Path, option: str) -> None:
-    other = command.folder / f"other{option}"
-    command(other, *TINY, option, "7")
+def test_another_seed_gives_other_pictures(placewise: CommandLine, out: Path, option: str) -> None:
+    other = placewise.folder / f"other{option}"
+    placewise(*SYNTH, other, *TINY, option, "7", "--json").json()
     assert not set(contents(other).values()) & set(contents(out).values())
 
 
-def test_folder_that_holds_anything_is_refused_and_left_alone(command: Command, out: Path) -> None:
+def test_folder_that_holds_anything_is_refused_and_left_alone(
+    placewise: CommandLine, out: Path
+) -> None:
     before = contents(out)
-    run = command(out, *SMALL, "--json", code=1)
-    problem = json.loads(run.stdout)
-    assert problem["code"] == "out_not_empty"
-    assert "empty" in problem["detail"]
+    refused = placewise(*SYNTH, out, *SMALL, "--json")
+    assert "empty" in refused.refusal("out_not_empty")
     assert contents(out) == before
 
 
-def test_folder_that_cannot_be_made_is_an_error_that_names_it(command: Command, out: Path) -> None:
-    run = command(out / "city.json" / "in", *TINY, "--json", code=1)
-    problem = json.loads(run.stdout)
-    assert problem["code"] == "out_unwritable"
-    assert "city.json" in problem["detail"]
+def test_folder_that_cannot_be_made_is_an_error_that_names_it(
+    placewise: CommandLine, out: Path
+) -> None:
+    refused = placewise(*SYNTH, out / "city.json" / "in", *TINY, "--json")
+    assert "city.json" in refused.refusal("out_unwritable")
 
 
 @pytest.mark.parametrize("wrong", [("--places", "0"), *(("--size", s) for s in ("63x240", "320"))])
 def test_impossible_numbers_are_refused_before_anything_is_written(
-    command: Command, wrong: tuple[str, str]
+    placewise: CommandLine, wrong: tuple[str, str]
 ) -> None:
-    run = command("never", *wrong, code=2)
+    run = placewise(*SYNTH, "never", *wrong)
+    assert (run.code, "Traceback" in run.stderr) == (2, False)
     assert wrong[0].lstrip("-") in run.stderr or "WxH" in run.stderr
-    assert not (command.folder / "never").exists()
+    assert not (placewise.folder / "never").exists()

@@ -2,33 +2,18 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.support.server import ServerProcess, environment, run_command
+from tests.support.server import CommandLine, ServerProcess
 
 MAP = "city"
 COMMAND_SECONDS = 600.0  # seconds of work, of which a busy machine makes minutes
 CONFIG = Path(__file__).parents[3] / "configs" / "train-boq.yaml"
 SMALL = {"max_steps": 1, "image_size": 64, "batch_size": 4, "num_workers": 0, "logger": "none"}
-
-
-class CommandLine:
-    """`placewise` in a folder, beside a server; its answers are JSON."""
-
-    def __init__(self, server: ServerProcess, folder: Path) -> None:
-        self.folder = folder
-        self._environment = environment(server.home)
-
-    def __call__(self, *arguments: str | Path) -> Any:
-        ended = run_command(
-            *arguments, "--json", env=self._environment, cwd=self.folder, seconds=COMMAND_SECONDS
-        )
-        assert ended.returncode == 0, ended.stderr + ended.stdout
-        return json.loads(ended.stdout)
 
 
 def recall(evaluated: Any) -> dict[str, Any]:
@@ -39,15 +24,18 @@ def recall(evaluated: Any) -> dict[str, Any]:
 
 
 @pytest.fixture
-def placewise(server: ServerProcess, tmp_path: Path) -> CommandLine:
-    return CommandLine(server, tmp_path)
+def placewise(server: ServerProcess, tmp_path: Path) -> Callable[..., Any]:
+    """`placewise` beside a server; its answers are JSON."""
+    command = CommandLine(tmp_path, server.home)
+    command.seconds = COMMAND_SECONDS
+    return lambda *arguments: command(*arguments, "--json").json()
 
 
 @pytest.mark.timeout(1800)
 def test_a_model_is_trained_evaluated_added_and_answers(
-    server: ServerProcess, placewise: CommandLine
+    placewise: Callable[..., Any], tmp_path: Path
 ) -> None:
-    city = placewise.folder / "city"
+    city = tmp_path / "city"
     small = ("--places", "6", "--views", "3", "--queries", "3", "--size", "96x72")
     placewise("datasets", "synth", city, *small)
 
@@ -56,7 +44,7 @@ def test_a_model_is_trained_evaluated_added_and_answers(
     trained = placewise("train", "--config", CONFIG, *folder, *options)
     best = Path(trained["best"]["path"])
     if not best.is_absolute():
-        best = placewise.folder / best
+        best = tmp_path / best
     assert trained["epochs"]
 
     evaluated = placewise("evaluate", "--data", city, "--checkpoint", best, "--out", "of-file")

@@ -19,9 +19,9 @@ from lab.datasets.utm_names import UtmFileName
 from shared.errors import PlacewiseError
 
 
-def utm_name(east: float, north: float, note: str = "", heading: float | None = None) -> str:
+def utm_name(east: float, north: float, note: str = "") -> str:
     """A file name at a place in UTM zone 32T, metres."""
-    return UtmFileName(east, north, 32, "T", note=note, heading=heading).file_name()
+    return UtmFileName(east, north, 32, "T", note=note).file_name()
 
 
 def write_photo(path: Path, number: int = 0) -> Path:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import unicodedata
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from PIL import Image
-from PIL.ExifTags import IFD, Base
 
 from services.cli.ingest.geotags import (
     LocalPhoto,
@@ -20,7 +19,7 @@ from services.cli.ingest.geotags import (
 )
 from services.cli.locate.sidecars import add_position
 from shared.errors import InvalidRequest
-from tests.support.photos import exif_with_position, photo_bytes
+from tests.support.photos import camera_exif, exif_with_position, photo_bytes
 
 # The Mole Antonelliana in Turin, zone 32T.
 EAST, NORTH = "396544.00", "4991543.00"
@@ -145,13 +144,9 @@ def test_copies_come_after_their_originals(tmp_path: Path) -> None:
 
 
 def test_sidecars_and_the_zone_of_the_camera_add_what_the_photos_lack(tmp_path: Path) -> None:
-    exif = Image.Exif()
-    exif[Base.Model] = "Camera"
-    exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = "2026:05:01 12:00:00"
-    zoned = Image.Exif()
-    zoned[Base.Model] = "Camera"
-    zoned.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = "2026:05:01 12:10:00"
-    zoned.get_ifd(IFD.Exif)[Base.OffsetTimeOriginal] = "+02:00"
+    exif = camera_exif(datetime(2026, 5, 1, 12, tzinfo=UTC), model="Camera")
+    at = datetime(2026, 5, 1, 12, 10, tzinfo=UTC)
+    zoned = camera_exif(at, offset="+02:00", model="Camera")
     (tmp_path / "1.jpg").write_bytes(photo_bytes(1, exif=exif))
     (tmp_path / "1.xmp").write_bytes(add_position(None, 45.5, 7.25, 10.0))
     (tmp_path / "2.jpg").write_bytes(photo_bytes(2, exif=zoned))

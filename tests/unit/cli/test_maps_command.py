@@ -7,11 +7,9 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner
 
-from services.cli.maps import app
-from shared.errors import InvalidRequest, Misconfigured
 from tests.support.api_responses import JOB, MAP
+from tests.support.commands import run, run_json
 from tests.support.fake_server import FakeServer, running_server
 
 
@@ -19,8 +17,7 @@ def test_create_sends_the_options_that_are_given(server: FakeServer) -> None:
     server.will_answer(201, MAP)
     options = ["--place-labels-are-paths", "--rows", "float16", "--matching", "off"]
     options += ["--elsewhere", "0.05"]
-    result = CliRunner().invoke(app, ["create", "tower", *options, "--server", server.url])
-    assert result.exit_code == 0, result.output
+    run("maps", "create", "tower", *options, "--server", server.url)
     _, path, body = server.requests[0]
     assert path == "/api/v1/maps"
     assert json.loads(body) == {
@@ -41,9 +38,7 @@ def test_matching_on_waits_for_the_local_features_and_says_how_many_there_are(
     done = on | {"local_features": features, "model_change_id": None}
     for answer in (on, JOB, [done]):
         server.will_answer(200, answer)
-    options = ["update", "tower", "--matching", "on", "--server", server.url]
-    result = CliRunner().invoke(app, options)
-    assert result.exit_code == 0, result.output
+    result = run("maps", "update", "tower", "--matching", "on", "--server", server.url)
     assert json.loads(server.requests[0][2]) == {"matching": "on"}
     assert server.requests[1][1].startswith(f"/api/v1/jobs/{JOB['job_id']}")
     assert "Map tower: matching on: 3 photos, 0.2 MB, used." in result.output
@@ -51,17 +46,13 @@ def test_matching_on_waits_for_the_local_features_and_says_how_many_there_are(
 
 def test_the_share_of_queries_from_elsewhere_is_changed(server: FakeServer) -> None:
     server.will_answer(200, MAP | {"elsewhere": 0.05})
-    options = ["update", "tower", "--elsewhere", "0.05", "--server", server.url]
-    result = CliRunner().invoke(app, options)
-    assert result.exit_code == 0, result.output
+    result = run("maps", "update", "tower", "--elsewhere", "0.05", "--server", server.url)
     assert json.loads(server.requests[0][2]) == {"elsewhere": 0.05}
     assert "5.0 % from elsewhere" in result.output
 
 
 def test_update_without_a_change_is_refused() -> None:
-    result = CliRunner().invoke(app, ["update", "tower"])
-    assert isinstance(result.exception, InvalidRequest)
-    assert result.exception.code == "no_option"
+    assert run_json("maps", "update", "tower", code=1)["code"] == "no_option"
 
 
 def test_with_the_settings_of_separate_services_no_server_is_started(
@@ -69,11 +60,11 @@ def test_with_the_settings_of_separate_services_no_server_is_started(
 ) -> None:
     monkeypatch.setenv("PLACEWISE_HOME", str(tmp_path))
     monkeypatch.setenv("SEARCH_URLS", "http://127.0.0.1:8100")
-    result = CliRunner().invoke(app, ["list"])
-    assert isinstance(result.exception, Misconfigured)
-    assert result.exception.code == "separate_services"
-    assert "PLACEWISE_SERVER" in result.exception.detail
-    assert result.output == "", "it does not say that it starts one"
+    result = run("maps", "list", "--json", code=1)
+    problem = json.loads(result.stdout)
+    assert problem["code"] == "separate_services"
+    assert "PLACEWISE_SERVER" in problem["detail"]
+    assert result.stderr == "", "it does not say that it starts one"
     assert not list(tmp_path.iterdir())
 
 
@@ -84,8 +75,7 @@ def test_list_fits_80_columns_with_whole_headers(monkeypatch: pytest.MonkeyPatch
     city = MAP | counts | {"name": "city", "dimension": 98_304}
     with running_server() as server:
         server.will_answer(200, [MAP | counts, city])
-        result = CliRunner().invoke(app, ["list", "--server", server.url])
-    assert result.exit_code == 0, result.output
+        result = run("maps", "list", "--server", server.url)
     assert all(len(line) <= 80 for line in result.output.splitlines()), result.output
     headers = ("photos", "searchable", "queries", "extractor", "vocabulary", "dimension")
     for word in (*headers, "123456", "98304"):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -11,18 +11,18 @@ from zipfile import ZipFile
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
-from services.cli.main import build_app
 from shared.descriptors import weight_files
 from shared.descriptors.backbones import torchhub as torchhub_module
 from shared.descriptors.backbones.dinov2 import SHAPES
 from tests.support.api_responses import JOB
+from tests.support.commands import run, run_json
 from tests.support.fake_server import running_server
 from tests.support.files_server import FilesServer, files_server
 from tests.support.hub import COMMIT, write_hub
 from tests.support.vit import random_weights, save
 
+models = partial(run_json, "models")
 VITS = "anyloc-vits14:layer=0"
 VITS_FILE = "/timm/vit_small_patch14_dinov2.lvd142m/resolve/main/model.safetensors"
 REPOSITORY = f"torchhub:somebody/places@{COMMIT}:colours"
@@ -60,15 +60,8 @@ def server(monkeypatch: pytest.MonkeyPatch, vits_weights: bytes) -> Iterator[Fil
         yield started
 
 
-def command(*arguments: str, exit_code: int = 0) -> Any:
-    """The JSON that `placewise models ARGUMENTS --json` prints."""
-    result = CliRunner().invoke(build_app(["models"]), ["models", *arguments, "--json"])
-    assert result.exit_code == exit_code, result.output
-    return json.loads(result.stdout)
-
-
 def listed(name: str) -> dict[str, Any]:
-    found: dict[str, Any] = next(w for w in command("list") if w["extractor"] == name)
+    found: dict[str, Any] = next(w for w in models("list") if w["extractor"] == name)
     return found
 
 
@@ -96,7 +89,7 @@ def test_list_shows_available_weights_and_how_to_get_missing_ones(
     assert (missing["available"], missing["path"]) == (False, None)
     assert "timm/vit_giant_patch14_dinov2.lvd142m" in missing["source"]
     assert "placewise models fetch anyloc-vitg14" in missing["note"]
-    assert not [w for w in command("list") if w["extractor"].startswith("test-")]
+    assert not [w for w in models("list") if w["extractor"].startswith("test-")]
 
 
 def test_weights_that_the_setting_names_are_listed_where_they_fit(
@@ -116,11 +109,11 @@ def test_weights_that_the_setting_names_are_listed_where_they_fit(
 
 
 def test_weights_are_fetched_ahead_of_time(server: FilesServer, vits_weights: bytes) -> None:
-    fetched = command("fetch", VITS)
+    fetched = models("fetch", VITS)
     assert Path(fetched["path"]).read_bytes() == vits_weights
     assert (fetched["available"], fetched["dimension"]) == (True, 64 * 384)
     count = len(server.requests)
-    assert command("fetch", VITS) == fetched
+    assert models("fetch", VITS) == fetched
     assert len(server.requests) == count, "a file that is present is not requested again"
 
 
@@ -131,7 +124,7 @@ def test_a_repository_is_fetched_at_its_commit_and_tried(
     server: FilesServer, caches: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server.files[f"/somebody/places/zipball/{COMMIT}"] = repository_zip(caches)
-    fetched = command("fetch", REPOSITORY)
+    fetched = models("fetch", REPOSITORY)
     assert fetched["dimension"] == 24
     assert fetched["licence"] == "MIT License (LICENSE)"
     assert fetched["size_bytes"] == 192 * 24 * 4
@@ -154,7 +147,7 @@ def test_weights_of_an_entry_are_downloaded_resumably(server: FilesServer, cache
     folder = write_hub(caches / "hub")
     hubconf = folder / "hubconf.py"
     hubconf.write_text(hubconf.read_text().replace("http://127.0.0.1:9", server.url))
-    fetched = command("fetch", f"torchhub:{folder}:from_network")
+    fetched = models("fetch", f"torchhub:{folder}:from_network")
     assert fetched["available"]
     assert server.requests == [("/weights.pth", None), ("/weights.pth", "bytes=10000-")]
     assert (caches / "torch" / "hub" / "checkpoints" / "weights.pth").exists()
@@ -166,22 +159,20 @@ def test_an_archive_of_something_else_is_refused(
 ) -> None:
     archive = repository_zip(caches, comment="f" * 40) if packed == "of another commit" else b"<p>"
     server.files[f"/somebody/places/zipball/{COMMIT}"] = archive
-    assert command("fetch", REPOSITORY, exit_code=1)["code"] == "download_corrupt"
+    assert models("fetch", REPOSITORY, code=1)["code"] == "download_corrupt"
     assert not (caches / "torch" / "hub" / f"somebody_places_{COMMIT}").exists()
 
 
 def test_fetch_prints_the_setting_that_allows_the_code(caches: Path) -> None:
     name = f"torchhub:{write_hub(caches / 'hub', licence=None)}:colours"
-    result = CliRunner().invoke(build_app(["models"]), ["models", "fetch", name])
-    assert result.exit_code == 0, result.output
-    reported = result.output.replace("\n", "")
+    reported = run("models", "fetch", name).output.replace("\n", "")
     assert f"CODE_ALLOWED={name}" in reported
     assert "Licence: none found" in reported
 
 
 def test_an_extractor_for_tests_has_nothing_to_fetch() -> None:
-    assert command("fetch", "test-tiny-avg", exit_code=1)["code"] == "no_weights"
-    assert command("fetch", "anyloc", exit_code=1)["code"] == "unknown_extractor"
+    assert models("fetch", "test-tiny-avg", code=1)["code"] == "no_weights"
+    assert models("fetch", "anyloc", code=1)["code"] == "unknown_extractor"
 
 
 def test_a_checkpoint_is_uploaded_under_the_name_of_its_file(tmp_path: Path) -> None:
@@ -199,9 +190,7 @@ def test_a_checkpoint_is_uploaded_under_the_name_of_its_file(tmp_path: Path) -> 
         gateway.will_answer(202, started)
         ended = {**JOB, "state": "succeeded", "result": {**made, "already_there": False}}
         gateway.will_answer(200, ended)
-        arguments = ["models", "add", str(checkpoint), "--name", "lab", "--server", gateway.url]
-        result = CliRunner().invoke(build_app(["models"]), arguments)
-    assert result.exit_code == 0, result.output
+        result = run("models", "add", checkpoint, "--name", "lab", "--server", gateway.url)
     assert "gsv:lab: 512 dimensions" in result.stdout
     body = gateway.requests[1][2]
     assert checkpoint.read_bytes() in body

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -14,7 +13,6 @@ import av
 import numpy as np
 import pytest
 from PIL import Image
-from PIL.ExifTags import IFD, Base
 
 from placewise.answers import OneTrack
 from services.cli.track.frame_sources import (
@@ -24,7 +22,7 @@ from services.cli.track.frame_sources import (
 )
 from services.cli.track.gpx import GPX_NAMESPACE, located_segments, to_gpx
 from shared.errors import InvalidRequest, Misconfigured
-from tests.support.photos import photo_bytes, photo_image
+from tests.support.photos import camera_exif, photo_bytes
 
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
 UNKNOWN = FrameTiming(every_seconds=2.0, begin=None)
@@ -32,14 +30,7 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def taken_at(number: int, time: datetime | None) -> bytes:
-    exif = Image.Exif()
-    if time is not None:
-        exif.get_ifd(IFD.Exif)[0x9003] = f"{time:%Y:%m:%d %H:%M:%S}"  # DateTimeOriginal
-        exif.get_ifd(IFD.Exif)[0x9011] = "+00:00"  # OffsetTimeOriginal
-        exif[Base.Software] = "test"
-    buffer = io.BytesIO()
-    photo_image(number).save(buffer, "JPEG", exif=exif)
-    return buffer.getvalue()
+    return photo_bytes(number, exif=camera_exif(time, offset="+00:00" if time else None))
 
 
 def test_photos_are_in_the_order_of_their_times_and_no_two_times_are_equal(tmp_path: Path) -> None:
@@ -163,13 +154,13 @@ def test_unreadable_videos_and_a_missing_decoder_are_reported(
         list(read_video_frames(text, UNKNOWN, tmp_path))
 
 
-def state(status: str, latitude: float | None, place: str | None = None) -> dict[str, Any]:
+def state(status: str, latitude: float | None) -> dict[str, Any]:
     return {
         "status": status,
         "image_id": UUID(int=1),
         "latitude": latitude,
         "longitude": None if latitude is None else 7.0,
-        "place": place,
+        "place": None,
         "heading": 90.0,
         "probability": 0.9,
         "levels": [],

@@ -29,7 +29,7 @@ from shared.descriptors.onnx_process import (
     PassFailed,
 )
 from shared.errors import Misconfigured, Unavailable, Unprocessable
-from shared.extractor_config.configs import get_extractor_config, pooled_config
+from shared.extractor_config.configs import get_extractor_config
 from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
 from tests.support.exported import (
     DIMENSION,
@@ -339,14 +339,6 @@ def test_the_kind_of_a_file_is_known_from_its_content(tmp_path: Path) -> None:
     damaged = data[:begin] + b"\xac" + data[begin + 1 :]
     text.write_bytes(damaged)
     assert exported_prefix(text, "t.pt") in (None, "torchscript:")
-
-
-def test_a_map_without_a_vocabulary_pools_the_patches_of_the_same_network() -> None:
-    config = config_of(f"onnx:town:aggregator=vlad,clusters=32,{SIZE}")
-    pooled = pooled_config(config)
-    assert pooled.name == f"onnx:town:aggregator=gem,{SIZE}"
-    assert pooled.backbone_key == config.backbone_key
-    assert config.backbone_key != config_of(f"onnx:town:{SIZE}").backbone_key
 
 
 def test_onnx_without_its_package_says_what_to_install(

@@ -16,8 +16,8 @@ Matrix = NDArray[np.float64]
 Aggregate = Callable[[torch.Tensor], torch.Tensor]
 
 
-def some_features(seed: int, photos: int = 3, patches: int = 40, width: int = 16) -> torch.Tensor:
-    values = np.random.default_rng(seed).standard_normal((photos, patches, width))
+def some_features(seed: int) -> torch.Tensor:
+    values = np.random.default_rng(seed).standard_normal((3, 40, 16))
     unit = values / np.linalg.norm(values, axis=-1, keepdims=True)
     return torch.from_numpy(unit.astype(np.float32))
 

@@ -173,18 +173,3 @@ def test_patch_whose_length_overflows_differs_from_one_without_structure(
     assert units.dtype == torch.float32
     np.testing.assert_allclose(units[:2], [[0.6, 0.8], [0.0, 0.0]], atol=1e-6)
     assert units[2:].isnan().all()
-
-
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_photo_whose_features_overflow_is_refused_and_not_described_without_them(
-    precision: Precision, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = Extractor(EXTRACTOR_CONFIGS["test-tiny-vlad"], CPU, precision=precision)
-    photos = np.random.default_rng(3).integers(0, 256, (2, 32, 32, 3), dtype=np.uint8)
-    photos[0] = 127  # about zero in every channel: its features stay small
-    centres = parse_centres(np.random.default_rng(2).standard_normal((5, 16)).astype(np.float32))
-    huge = made.backbone._projection * 1e20  # type: ignore[attr-defined]
-    monkeypatch.setattr(made.backbone, "_projection", huge)
-    rows = made.describe(photos, centres)
-    assert np.isfinite(rows[0]).all()
-    assert np.isnan(rows[1]).all()

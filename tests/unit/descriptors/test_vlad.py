@@ -159,16 +159,6 @@ def test_zero_patches_stay_out_of_the_sums_and_a_photo_of_nothing_else_is_simila
 
 
 @BOTH
-def test_photo_with_a_number_that_is_not_finite_has_a_row_of_nan(aggregate: Aggregate) -> None:
-    for broken in (math.nan, math.inf, -math.inf):
-        features = tensor(some_patches(5, 3, 7, 8))
-        features[1, 2, 3] = broken
-        rows = aggregate(features, tensor(raw_centres(6, 4, 8)))
-        assert bool(torch.isnan(rows[1]).all())
-        assert bool(torch.isfinite(rows[[0, 2]]).all())
-
-
-@BOTH
 def test_no_tensor_is_as_large_as_all_residuals(aggregate: Aggregate) -> None:
     patches, clusters, width = 60, 50, 70
     features, centres = some_patches(1, 2, patches, width), raw_centres(2, clusters, width)

@@ -40,9 +40,9 @@ def begun(target: Path) -> Path:
     return target.with_name("weights.pth.part")
 
 
-def break_off(server: FilesServer, target: Path, after: int = 2_000_000) -> int:
+def break_off(server: FilesServer, target: Path) -> int:
     """The download ends in an error, as with a network that is gone; the bytes that were stored."""
-    server.break_after = [after]
+    server.break_after = [2_000_000]
     server.refuse = []
     with pytest.raises(httpx2.HTTPError):
         # The first answer breaks off; every later one brings nothing.

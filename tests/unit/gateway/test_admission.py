@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -15,6 +15,7 @@ from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import TooManyRequests
 from shared.jobs.queue_depth import QueueDepth
+from tests.support.threads import at_once
 
 LIMIT, THREADS = 2000, 4
 
@@ -46,5 +47,4 @@ def test_concurrent_uploads_into_many_maps_are_admitted_up_to_the_limit_exactly(
                 return number
         return LIMIT
 
-    with ThreadPoolExecutor(THREADS) as threads:
-        assert sum(threads.map(admit, range(THREADS))) == LIMIT
+    assert sum(at_once(*(partial(admit, thread) for thread in range(THREADS)))) == LIMIT

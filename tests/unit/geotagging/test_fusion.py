@@ -35,9 +35,7 @@ def known(seconds: float, east: float, north: float, name: str = "") -> KnownPos
     return KnownPosition(NOON + timedelta(seconds=seconds), *PLANE.to_degrees(east, north), name)
 
 
-def picture(
-    *similar: tuple[float, float, float], probability: float = 0.6, not_in_map: float = 0.02
-) -> PictureEvidence:
+def picture(*similar: tuple[float, float, float], probability: float = 0.6) -> PictureEvidence:
     """Photos of a map of 1,000 at (east, north, score); the estimate is the first one."""
     photos = [
         SimilarPosition(*PLANE.to_degrees(east, north), score, f"{number}.jpg")
@@ -47,7 +45,7 @@ def picture(
         ProbableCircle(photos[0].latitude, photos[0].longitude, radius, probability + 0.02 * ring)
         for ring, radius in enumerate((25.0, 100.0, 500.0, 2000.0))
     ]
-    return PictureEvidence(photos, circles, not_in_map, 1000)
+    return PictureEvidence(photos, circles, 0.02, 1000)
 
 
 def proposed(

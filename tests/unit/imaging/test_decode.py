@@ -5,12 +5,14 @@ from __future__ import annotations
 import io
 import random
 import struct
+import zlib
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 from PIL.PngImagePlugin import PngInfo
@@ -120,6 +122,31 @@ def test_published_preprocessings_ignore_the_exif_orientation(name: str) -> None
 def test_16_bit_grey_is_scaled_and_not_clipped_to_white(media: str) -> None:
     samples = np.full((20, 30), 0x8000, dtype=np.uint16)
     assert mean_colour(encoded(Image.fromarray(samples), media)) == (128, 128, 128)
+
+
+def png16(samples: NDArray[np.uint16]) -> bytes:
+    """A PNG of 16-bit samples (H, W, 3), which Pillow reads but can't write."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
+
+    height, width = samples.shape[:2]
+    header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
+    lines = samples.astype(">u2").reshape(height, -1)
+    body = zlib.compress(b"".join(b"\0" + line.tobytes() for line in lines))
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
+    )
+
+
+def test_16_bit_colours_keep_their_upper_eight_bits() -> None:
+    eight = np.asarray(photo_image(3))
+    below = np.random.default_rng(0).integers(0, 256, eight.shape, dtype=np.uint16)
+    data = png16(eight.astype(np.uint16) * np.uint16(256) + below)
+    decoded = decode_photo(data, SQUARE, PIXELS)
+    np.testing.assert_array_equal(decoded.pixels, SQUARE.apply(photo_image(3)))
 
 
 def test_cmyk_jpeg_has_its_colours() -> None:

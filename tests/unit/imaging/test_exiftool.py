@@ -91,11 +91,14 @@ SENSELESS: dict[str, Fields] = {
     "letters exchanged": located(*SHAPES["seconds"], ("E", "N")),
     "minutes unknown": located((RATIONAL, (45, 1, 0, 0, 0, 0)), SHAPES["seconds"][1]),
     "seconds unknown": located((RATIONAL, (45, 1, 4, 1, 0, 0)), SHAPES["seconds"][1]),
+    "degrees infinite": located((RATIONAL, (45, 0, 4, 1, 1, 1)), SHAPES["seconds"][1]),
+    "four numbers": located((RATIONAL, (45, 1, 4, 1, 12, 1, 1, 1)), SHAPES["seconds"][1]),
     "seconds infinite": located((RATIONAL, (45, 1, 4, 1, 9, 0)), SHAPES["seconds"][1]),
     "minutes beyond 60": located((RATIONAL, (45, 1, 75, 1, 0, 1)), SHAPES["seconds"][1]),
     "signs that differ": located(
         (SRATIONAL, (-45, 1, 4, 1, 0, 1)), SHAPES["seconds"][1], ("S", "E")
     ),
+    "another datum": located(*SHAPES["seconds"], ("N", "E"), GPSMapDatum=(ASCII, "Tokyo ")),
     "latitude beyond the pole": located((RATIONAL, (95, 1)), SHAPES["seconds"][1]),
     "longitude beyond 180": located(SHAPES["seconds"][0], (RATIONAL, (200, 1))),
     "latitude only": {
@@ -104,6 +107,8 @@ SENSELESS: dict[str, Fields] = {
 }
 NOWHERE: dict[str, Fields] = {
     "zeros": located((RATIONAL, (0, 1) * 3), (RATIONAL, (0, 1) * 3)),
+    "zeros without letters": located((RATIONAL, (0, 1) * 3), (RATIONAL, (0, 1) * 3), ("", "")),
+    "one zero": located((RATIONAL, (0, 1)), (RATIONAL, (0, 1))),
     "0/0": located((RATIONAL, (0, 0) * 3), (RATIONAL, (0, 0) * 3)),
     "nothing but a version": {GPS.GPSVersionID: (BYTE, (2, 3, 0, 0))},
 }

@@ -12,7 +12,7 @@ import numpy as np
 import pillow_heif
 import pytest
 from PIL import Image
-from PIL.ExifTags import GPS, IFD, Base
+from PIL.ExifTags import Base
 
 from shared.errors import Unprocessable
 from shared.imaging.decode import THUMBNAIL_PIXELS, decode_photo
@@ -20,7 +20,7 @@ from shared.imaging.file_formats import detect_media_type
 from shared.imaging.photo_header import read_photo_header
 from shared.imaging.preprocessing import get_preprocessing
 from tests.support import hostile_headers
-from tests.support.photos import photo_image
+from tests.support.photos import exif_with_position, photo_image
 
 PIXELS = 50_000_000
 SQUARE = get_preprocessing("square32")
@@ -32,19 +32,8 @@ def heic(image: Image.Image, **options: Any) -> bytes:
     return buffer.getvalue()
 
 
-def taken_in_turin(orientation: int = 1) -> bytes:
-    exif = Image.Exif()
-    exif[Base.Orientation] = orientation
-    exif[IFD.GPSInfo] = {
-        GPS.GPSLatitudeRef: "N",
-        GPS.GPSLatitude: (45.0, 4.0, 12.0),
-        GPS.GPSLongitudeRef: "E",
-        GPS.GPSLongitude: (7.0, 41.0, 24.0),
-    }
-    return exif.tobytes()
-
-
-PHOTO = heic(photo_image(1, 320, 200), exif=taken_in_turin())
+IN_TURIN: bytes = exif_with_position(45.07, 7.69).tobytes()
+PHOTO = heic(photo_image(1, 320, 200), exif=IN_TURIN)
 
 
 @pytest.fixture
@@ -142,7 +131,7 @@ def test_a_file_with_a_heic_signature_and_no_photo_is_refused(data: bytes, why: 
 
 
 def test_exif_behind_an_item_of_several_extents_is_read_and_so_is_exif_in_several() -> None:
-    exif = b"\0\0\0\6" + taken_in_turin()
+    exif = b"\0\0\0\6" + IN_TURIN
     at = 1000
     iloc = struct.pack(">HHH", 1, 0, 3) + bytes(24) + struct.pack(">HHHII", 2, 0, 1, at, len(exif))
     data = hostile_headers.heic(iloc, entries=2).ljust(at, b"\0") + exif

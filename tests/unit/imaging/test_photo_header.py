@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 from PIL.PngImagePlugin import PngInfo
-from PIL.TiffImagePlugin import IFDRational
 
 from shared.errors import Unprocessable
 from shared.imaging.decode import decode_photo
@@ -89,39 +88,6 @@ def reason(data: bytes, max_pixels: int = PIXELS) -> Unprocessable:
     with pytest.raises(Unprocessable) as caught:
         header(data, max_pixels)
     return caught.value
-
-
-@pytest.mark.parametrize(
-    "broken",
-    [
-        {GPS.GPSLatitude: (91.0, 0.0, 0.0)},
-        {GPS.GPSLongitude: (180.0, 0.0, 1.0)},
-        {GPS.GPSLatitude: (45.0, 75.0, 0.0)},
-        {GPS.GPSLatitude: (45.0, 4.0, 12.0, 1.0)},
-        {GPS.GPSLatitude: (IFDRational(45, 0), 4.0, 1.0)},
-        {GPS.GPSLatitudeRef: b"\x00\x01"},
-        {GPS.GPSLongitudeRef: ""},
-        {GPS.GPSLatitudeRef: "E"},
-        {GPS.GPSLongitudeRef: None, GPS.GPSLongitude: None},
-        {GPS.GPSMapDatum: "Tokyo "},
-    ],
-)
-def test_incomplete_or_out_of_range_gps_positions_are_ignored(broken: Tags) -> None:
-    given = {**position("N", "E"), **broken}
-    found = header(encoded(exif=exif_with({key: v for key, v in given.items() if v is not None})))
-    assert (found.latitude, found.longitude) == (None, None)
-    assert found.gps_error is not None, "nothing may be written over it"
-    assert (found.width, found.height) == (64, 48)
-
-
-@pytest.mark.parametrize("zero", [(0.0, 0.0, 0.0), (IFDRational(0, 0),) * 3, (0.0,)])
-@pytest.mark.parametrize("letters", [("N", "E"), ("\0", "\0")])
-def test_gps_coordinates_0_0_are_ignored_without_an_error(
-    zero: tuple[Any], letters: tuple[str, str]
-) -> None:
-    gps = {**position(*letters), GPS.GPSLatitude: zero, GPS.GPSLongitude: zero}
-    found = header(encoded(exif=exif_with(gps)))
-    assert (found.latitude, found.longitude, found.gps_error) == (None, None, None)
 
 
 @pytest.mark.parametrize(("fields", "heading"), [(12.5, 12.5), (0, 0), (360, 0), (372.5, 12.5)])

@@ -135,7 +135,7 @@ def test_cubic_overshoot_is_neither_clipped_nor_rounded() -> None:
 @pytest.mark.parametrize("name", ["square224", "square32"])
 def test_square_preprocessing_equals_pillows_resizing(name: str) -> None:
     side = int(name.removeprefix("square"))
-    for size in SIZES:
+    for size in [*SIZES, (10, 20_000)]:
         expected = photo(*size).resize((side, side), Image.Resampling.BILINEAR)
         pixels = get_preprocessing(name).apply(photo(*size))
         assert pixels.dtype == np.uint8

@@ -154,7 +154,6 @@ def cases(draw: st.DrawFn, dimension: int) -> Case:
 def facts_of(
     photo_id: UUID,
     *,
-    role: PhotoRole = PhotoRole.DATABASE,
     latitude: float | None = None,
     longitude: float | None = None,
     captured_at: datetime | None = None,
@@ -163,5 +162,5 @@ def facts_of(
 ) -> PhotoFilterValues:
     """A live photo; fields that are not given are unknown."""
     return PhotoFilterValues(
-        photo_id, role, None, latitude, longitude, captured_at, place, list(tags)
+        photo_id, PhotoRole.DATABASE, None, latitude, longitude, captured_at, place, list(tags)
     )

@@ -218,16 +218,6 @@ def summed_in_order(snapshot: Snapshot, rows: Any, query: Rows, kind: Any) -> An
     return np.cumsum(stored * query.astype(kind), axis=1, dtype=kind)[:, -1]
 
 
-def test_excluded_photos_make_room_for_the_next() -> None:
-    rows = unit_rows(7, 6, 8)
-    snapshot = snapshot_of(rows, 2, coded=False)
-    everything = hits_of(scan(snapshot, rows[3], 6))
-    assert everything[0][0] == photo(3)
-    excluded = frozenset({photo(3), everything[2][0]})
-    without = hits_of(scan(snapshot, rows[3], 3, exclude=excluded))
-    assert without == [everything[1], everything[3], everything[4]]
-
-
 def test_nothing_is_found_without_rows_or_with_a_query_of_zeros() -> None:
     rows = unit_rows(11, 2, 4)
     nothing = scan(Snapshot(new_id(), new_id(), 1, ()), rows[0], 5)

@@ -15,9 +15,9 @@ from shared.tracks.photo_graph import PhotoTable
 START = datetime(2026, 1, 1, tzinfo=UTC)
 
 
-def line_map(count: int, spacing_m: float = 10.0) -> ArrayPhotoGraph:
-    """A street: photos every few metres to the east, on the equator, looking east."""
-    degrees = np.degrees(spacing_m / EARTH_RADIUS_M)
+def line_map(count: int) -> ArrayPhotoGraph:
+    """A street: photos every 10 metres to the east, on the equator, looking east."""
+    degrees = np.degrees(10.0 / EARTH_RADIUS_M)
     return ArrayPhotoGraph(
         PhotoTable.of_rows(
             (str(number), 0.0, number * degrees, 90.0, None, None, None) for number in range(count)

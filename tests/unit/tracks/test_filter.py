@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -47,6 +48,14 @@ def random_frames(seed: int, steps: int) -> list[FrameEvidence]:
         shares = rng.dirichlet(np.full(COUNT, 0.5)) * 0.98 + 0.02 / COUNT
         frames.append(frame(2.0 * step, shares.tolist()))
     return frames
+
+
+def follow(track_filter: TrackFilter, frames: Iterable[FrameEvidence]) -> list[Belief]:
+    """The beliefs after each of the frames."""
+    beliefs: list[Belief] = []
+    for each in frames:
+        beliefs.append(track_filter.advance(beliefs[-1] if beliefs else None, each))
+    return beliefs
 
 
 def brute_force(frames: list[FrameEvidence]) -> NDArray[np.float64]:
@@ -124,23 +133,18 @@ def test_forward_and_backward_together_are_those_of_the_hidden_markov_model(seed
 
 def test_a_camera_that_stands_still_learns_nothing_from_more_frames_of_the_same_view() -> None:
     track_filter = TrackFilter(line_map(20), WALK)
-    first = track_filter.advance(None, pointing_at(7, 20, 0))
-    belief = first
-    for _ in range(30):
-        belief = track_filter.advance(belief, pointing_at(7, 20, 0))
-    state, before = track_filter.state(belief), track_filter.state(first)
+    first, *_, last = follow(track_filter, [pointing_at(7, 20, 0)] * 31)
+    state, before = track_filter.state(last), track_filter.state(first)
     assert state.probability == pytest.approx(before.probability, abs=0.15)
 
 
 def test_frames_that_follow_the_street_are_tracked_with_their_position_and_heading() -> None:
-    track_filter, belief = TrackFilter(line_map(200), motion_model(15.0)), None
-    statuses = []
-    for step in range(12):
-        belief = track_filter.advance(belief, pointing_at(50 + step, 200, step, 0.3))
-        statuses.append(belief.status)
-    assert belief is not None
-    state = track_filter.state(belief)
-    assert statuses[0] == "converging"
+    track_filter = TrackFilter(line_map(200), motion_model(15.0))
+    first, *_, last = follow(
+        track_filter, (pointing_at(50 + step, 200, step, 0.3) for step in range(12))
+    )
+    state = track_filter.state(last)
+    assert first.status == "converging"
     assert state.status == "tracking"
     assert state.photo in {"60", "61"}
     assert state.longitude == pytest.approx(61 * np.degrees(10 / 6_371_008.8), abs=2e-4)
@@ -153,53 +157,44 @@ def test_frames_that_follow_the_street_are_tracked_with_their_position_and_headi
 
 
 def test_a_kidnapped_camera_is_relocalised() -> None:
-    track_filter, belief = TrackFilter(line_map(500), motion_model(15.0)), None
-    for step in range(20):
-        belief = track_filter.advance(belief, pointing_at(50 + step, 500, step, 0.3))
-    assert belief is not None
-    assert str(track_filter.state(belief).photo) in {"68", "69", "70"}
-    for step in range(20, 25):
-        belief = track_filter.advance(belief, pointing_at(380 + step, 500, step, 0.3))
-    assert belief.status == "tracking"
-    assert str(track_filter.state(belief).photo) in {"403", "404", "405"}
+    track_filter = TrackFilter(line_map(500), motion_model(15.0))
+    shown = [*range(50, 70), *range(400, 405)]
+    beliefs = follow(
+        track_filter, (pointing_at(photo, 500, step, 0.3) for step, photo in enumerate(shown))
+    )
+    assert str(track_filter.state(beliefs[19]).photo) in {"68", "69", "70"}
+    assert beliefs[24].status == "tracking"
+    assert str(track_filter.state(beliefs[24]).photo) in {"403", "404", "405"}
 
 
 def test_a_camera_that_leaves_the_map_is_lost_and_nowhere_else() -> None:
     rng = np.random.default_rng(3)
-    track_filter, belief = TrackFilter(line_map(500), motion_model(15.0)), None
-    for step in range(20):
-        belief = track_filter.advance(belief, pointing_at(50 + step, 500, step, 0.3))
-    statuses = []
-    for step in range(20, 60):
-        shares = rng.dirichlet(np.full(500, 0.05)) * 0.7
-        belief = track_filter.advance(belief, frame(step, shares.tolist()))
-        statuses.append(belief.status)
+    frames = [pointing_at(50 + step, 500, step, 0.3) for step in range(20)]
+    elsewhere = rng.dirichlet(np.full(500, 0.05), 40) * 0.7
+    frames += [frame(step, shares.tolist()) for step, shares in enumerate(elsewhere, 20)]
+    beliefs = follow(TrackFilter(line_map(500), motion_model(15.0)), frames)
+    statuses = [belief.status for belief in beliefs[20:]]
     assert statuses.index("lost") < 20
     assert "tracking" not in statuses[20:]
-    assert belief is not None
-    assert belief.outside > 0.5
+    assert beliefs[-1].outside > 0.5
 
 
 def test_a_track_of_weak_evidence_measures_the_outside_by_its_own_level() -> None:
     """Frames that would be foreign in a ride of clear views are usual in one of dim views."""
     outside = {}
     for clear in (0.2, 0.02):
-        track_filter, belief = TrackFilter(line_map(500), motion_model(15.0)), None
-        for step in range(60):
-            shown = clear if step < 40 else 0.02
-            belief = track_filter.advance(belief, pointing_at(50 + step, 500, step, shown))
-        assert belief is not None
-        outside[clear] = belief.outside
+        shown = [clear] * 40 + [0.02] * 20
+        frames = (pointing_at(50 + step, 500, step, share) for step, share in enumerate(shown))
+        *_, last = follow(TrackFilter(line_map(500), motion_model(15.0)), frames)
+        outside[clear] = last.outside
     assert outside[0.2] > 3 * outside[0.02]
 
 
 def test_the_gain_is_learnt_from_tracked_frames_and_follows_the_light() -> None:
-    track_filter, belief = TrackFilter(line_map(500), motion_model(15.0)), None
-    gains = []
-    for step in range(400):
-        shown = 0.5 if step < 100 else 0.05
-        belief = track_filter.advance(belief, pointing_at(50 + step, 500, step, shown))
-        gains.append(belief.gain)
+    shown = [0.5] * 100 + [0.05] * 300
+    frames = (pointing_at(50 + step, 500, step, share) for step, share in enumerate(shown))
+    beliefs = follow(TrackFilter(line_map(500), motion_model(15.0)), frames)
+    gains = [belief.gain for belief in beliefs]
     assert gains[0] < 1.0 < 2.0 < gains[99]
     assert gains[399] < 0.8 * gains[99]
 
@@ -234,14 +229,10 @@ def test_odometry_decides_between_two_directions_of_the_same_view() -> None:
 
 
 def test_a_position_fix_finds_photos_that_no_hit_points_to() -> None:
-    graph = line_map(300)
     fix = PositionFix(latitude=0.0, longitude=np.degrees(2000 / 6_371_008.8), accuracy_m=8.0)
-    track_filter, belief = TrackFilter(graph, WALK), None
-    for step in range(4):
-        evidence = FrameEvidence(time=at(step), fix=fix)
-        belief = track_filter.advance(belief, evidence)
-    assert belief is not None
-    state = track_filter.state(belief)
+    track_filter = TrackFilter(line_map(300), WALK)
+    *_, last = follow(track_filter, (FrameEvidence(time=at(step), fix=fix) for step in range(4)))
+    state = track_filter.state(last)
     assert state.status == "tracking"
     assert state.photo in {"199", "200", "201"}
 
@@ -278,20 +269,19 @@ def test_sequences_without_coordinates_are_followed_along_their_own_time() -> No
     assert right > 40
 
 
-def follow_film(shown: list[int], count: int = 400) -> tuple[list[int], Belief]:
+def follow_film(shown: list[int]) -> tuple[list[int], Belief]:
     """Follow a ride along a film whose frames resemble the photos around the right one."""
     rng = np.random.default_rng(1)
     scheme = LevelScheme(labels_are_paths=False, radii_m=(200.0,))
-    track_filter = TrackFilter(sequence_map(count), MOTION_MODELS["train"], scheme)
-    belief, found = None, []
-    places, noise = np.arange(count), rng.normal(size=(count, count))
+    track_filter = TrackFilter(sequence_map(400), MOTION_MODELS["train"], scheme)
+    frames = []
+    places, noise = np.arange(400), rng.normal(size=(400, 400))
     for step, photo in enumerate(shown):
         # The same photo is the same view again, with the same resemblances.
         likeness = np.exp(4 * np.exp(-0.5 * ((places - photo) / 1.5) ** 2) + 0.8 * noise[photo])
-        belief = track_filter.advance(belief, frame(step, (likeness / likeness.sum()).tolist()))
-        found.append(int(track_filter.state(belief).photo or -1))
-    assert belief is not None
-    return found, belief
+        frames.append(frame(step, (likeness / likeness.sum()).tolist()))
+    beliefs = follow(track_filter, frames)
+    return [int(track_filter.state(each).photo or -1) for each in beliefs], beliefs[-1]
 
 
 @pytest.mark.parametrize("pace", [0.5, 2.5, -1.0])
@@ -317,16 +307,15 @@ def test_frames_that_mislead_to_the_same_photos_of_a_sequence_are_not_tracked() 
         MOTION_MODELS["train"],
         LevelScheme(labels_are_paths=False, radii_m=(200.0,)),
     )
-    belief, statuses = None, []
+    frames = []
     for step in range(180):
         lure = 100 + 90 * (step // 60)
         likeness = np.exp(rng.normal(size=400))
         likeness[lure - 2 : lure + 3] *= rng.uniform(10, 60, 5)
-        belief = track_filter.advance(belief, frame(step, (likeness / likeness.sum()).tolist()))
-        statuses.append(belief.status)
-    assert belief is not None
-    assert statuses.count("tracking") < 9
-    assert track_filter.state(belief).probability < 0.5
+        frames.append(frame(step, (likeness / likeness.sum()).tolist()))
+    beliefs = follow(track_filter, frames)
+    assert [belief.status for belief in beliefs].count("tracking") < 9
+    assert track_filter.state(beliefs[-1]).probability < 0.5
 
 
 def follow_rooms(
@@ -341,14 +330,12 @@ def follow_rooms(
         )
     )
     scheme = LevelScheme(labels_are_paths=True, radii_m=(25.0,))
-    track_filter, belief, beliefs = TrackFilter(graph, WALK, scheme), None, []
+    track_filter, frames = TrackFilter(graph, WALK, scheme), []
     for second, room in enumerate(shown):
         shares = np.full(120, 0.5 / 110)
         shares[10 * room : 10 * room + 10] = 0.5 * rng.dirichlet(np.full(10, 0.3))
-        each = frame(second, shares.tolist()).model_copy(update={"missing": missing})
-        belief = track_filter.advance(belief, each)
-        beliefs.append(belief)
-    return track_filter, beliefs
+        frames.append(frame(second, shares.tolist()).model_copy(update={"missing": missing}))
+    return track_filter, follow(track_filter, frames)
 
 
 def test_frames_that_agree_on_a_room_are_not_tracked_if_each_looks_foreign_to_the_map() -> None:
@@ -376,10 +363,9 @@ def test_a_camera_goes_on_to_a_room_of_its_floor_sooner_than_to_one_of_another_f
 
 
 def test_a_camera_is_expected_to_go_on_as_it_did_unless_it_sees_nothing_new() -> None:
-    track_filter, belief = TrackFilter(line_map(200), motion_model(15.0)), None
-    for step in range(20):
-        belief = track_filter.advance(belief, pointing_at(50 + step, 200, step, 0.3))
-    assert belief is not None
+    track_filter = TrackFilter(line_map(200), motion_model(15.0))
+    frames = (pointing_at(50 + step, 200, step, 0.3) for step in range(20))
+    belief = follow(track_filter, frames)[-1]
     assert belief.velocity[1] * METRES_PER_DEGREE == pytest.approx(10.0, abs=3.0)
 
     def mean_photo(after: Belief) -> float:

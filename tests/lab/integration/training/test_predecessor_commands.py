@@ -5,15 +5,13 @@ from __future__ import annotations
 import json
 import shlex
 from pathlib import Path
-from typing import Any
 
 import httpx2
 import pytest
 import torch
-from typer.testing import CliRunner
 
-from services.cli.main import build_app
 from tests.lab.training_runs import PUBLISHED_COMMAND, write_tiny_places
+from tests.support.commands import run
 
 REPOSITORY = Path(__file__).parents[4]
 # What the small data and a machine without a GPU need; all other arguments are as published.
@@ -46,14 +44,8 @@ def data(tmp_path: Path) -> list[str]:
     return ["--data_root", str(places / "gsv_xs"), "--eval_roots", roots]
 
 
-def command(name: str, *tokens: str, code: int = 0) -> Any:
-    answer = CliRunner().invoke(build_app([name]), [name, *tokens])
-    assert answer.exit_code == code, answer.output
-    return answer
-
-
 def test_the_published_command_trains_with_one_warning_about_faiss(data: list[str]) -> None:
-    answer = command("train", *shlex.split(PUBLISHED_COMMAND), *data, *HERE, "--json")
+    answer = run("train", *shlex.split(PUBLISHED_COMMAND), *data, *HERE, "--json")
     report = json.loads(answer.stdout)
     assert report["monitor"] == "sfxs_val/R1"
     assert report["arguments"]["faiss_gpu"] is True
@@ -71,7 +63,7 @@ def test_all_obstacles_of_a_machine_are_in_one_message(data: list[str], tmp_path
         "--accelerator",
         "mps",
     ]
-    answer = command("train", *tokens, "--val_set_names", "sfxs_vla", code=1)
+    answer = run("train", *tokens, "--val_set_names", "sfxs_vla", code=1)
     for obstacle in ("no_gpu: ", "set_missing: ", "weights_missing: "):
         assert f"- {obstacle}" in answer.stderr
     assert answer.stderr.lstrip().startswith("several_obstacles: ")
@@ -82,9 +74,9 @@ def test_the_published_grid_without_weights_ends_with_a_leaderboard_of_28_failed
 ) -> None:
     file = str(REPOSITORY / "configs" / "predecessor-grid.yaml")
     small = [file, *data, *HERE, "--out", str(tmp_path / "grid")]
-    command("grid", *small, "--dry-run")
+    run("grid", *small, "--dry-run")
     without_gpu = [*small, "--accelerator", "gpu"]
-    found = command("grid", *without_gpu, "--dry-run", code=1)
+    found = run("grid", *without_gpu, "--dry-run", code=1)
     assert "every run can't start: no_gpu" in found.stderr
     (tmp_path / "torch/hub/checkpoints/resnet18-f37072fd.pth").unlink()
     tried: list[str] = []
@@ -94,7 +86,7 @@ def test_the_published_grid_without_weights_ends_with_a_leaderboard_of_28_failed
         raise httpx2.ConnectError("no network")
 
     monkeypatch.setattr("shared.descriptors.vpr_models.backbones.download_file", download)
-    ended = command("grid", *small, code=1)
+    ended = run("grid", *small, code=1)
     assert len(tried) == 1, "each attempt takes minutes"
     assert ended.stdout.count("failed: weights_missing") == 28
     assert ended.stderr.count("no network") == 1
@@ -108,6 +100,6 @@ def test_a_run_of_the_published_grid_is_trained_and_tested(data: list[str], tmp_
     grid["runs"] = [run for run in grid["runs"] if run["name"].startswith("26-")]
     file = tmp_path / "one.yaml"
     file.write_text(yaml.safe_dump(grid))
-    command("grid", str(file), *data, *HERE, "--out", str(tmp_path / "grid"))
+    run("grid", str(file), *data, *HERE, "--out", str(tmp_path / "grid"))
     metrics = next((tmp_path / "grid").glob("26-*/metrics.json"))
     assert set(json.loads(metrics.read_text())["test"]) == {"sfxs_test", "tokyoxs_test"}

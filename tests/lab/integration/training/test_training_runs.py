@@ -11,12 +11,10 @@ from typing import Any
 
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from lab.training import run
 from lab.training.arguments import build_arguments, load_yaml
 from lab.training.run_control import NullDisplay, RunStopped, StopRequest
-from services.cli.main import build_app
 from shared.descriptors.aggregators import AGGREGATORS
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.vpr_models.checkpoint import load_checkpoint
@@ -33,6 +31,8 @@ from tests.lab.training_runs import (
 )
 from tests.lab.unit.data_sets import refused
 from tests.lab.unit.training.test_own_modules import CODE
+from tests.support.commands import run as run_command
+from tests.support.commands import run_json
 
 Json = dict[str, Any]
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -92,10 +92,7 @@ def test_tests_and_on_demand_validations_leave_predictions_that_evaluate_reads(
         for epoch in report["epochs"]
     ]
     for file, recall in zip(files, recalls, strict=True):
-        command = ["evaluate", "--predictions", str(file), "--data", str(places), "--set", name]
-        answer = CliRunner().invoke(build_app(["evaluate"]), [*command, "--json"])
-        assert answer.exit_code == 0, answer.output
-        evaluated = json.loads(answer.stdout)
+        evaluated = run_json("evaluate", "--predictions", file, "--data", places, "--set", name)
         assert evaluated["recall"] == {k: recall[k] for k in evaluated["recall"]}
     assert f"--data {places} --set {name}" in report["next"][0]
 
@@ -247,9 +244,8 @@ def test_the_grid_command_makes_every_run_names_the_failed_one_and_ranks_the_oth
                     "runs": [{"name": "wrong", **mixvpr}]})
     )  # fmt: skip
     out = tmp_path / "grid"
-    command = ["grid", str(file), "--out", str(out)]
-    dry = CliRunner().invoke(build_app(["grid"]), [*command, "--dry-run", "--json"])
-    assert dry.exit_code == 1, dry.output
+    command = ["grid", file, "--out", out, "--json"]
+    dry = run_command(*command, "--dry-run", code=1)
     assert "wrong can't start: bad_agg_config" in dry.stderr
     assert [(row["run"], row["state"]) for row in json.loads(dry.stdout)] == [
         ("AVG", "waiting"),
@@ -257,8 +253,7 @@ def test_the_grid_command_makes_every_run_names_the_failed_one_and_ranks_the_oth
         ("wrong", "waiting"),
     ]
     assert not out.exists()
-    answer = CliRunner().invoke(build_app(["grid"]), [*command, "--json"])
-    assert answer.exit_code == 1, answer.output
+    answer = run_command(*command, code=1)
     states = {each["run"]["name"]: each["state"] for each in json.loads(answer.stdout)}
     assert states == {"AVG": "finished", "GeM": "finished", "wrong": "failed"}
     assert "wrong failed: bad_agg_config" in answer.stderr.replace("\n", " ")

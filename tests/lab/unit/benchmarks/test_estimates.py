@@ -9,16 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.progress import Progress
-from typer.testing import CliRunner
 
 from lab.benchmarks import estimates
 from lab.benchmarks.estimates import (
     DescribedPhotos,
 )
-from services.cli.main import build_app
 from shared.errors import Misconfigured
 from shared.evaluation.places.evidence import PhotoLocation
 from shared.evaluation.places.levels import LevelScheme
+from tests.support.commands import run
 
 PLACES, PER_PLACE, FLOORS = 24, 6, 8
 
@@ -41,16 +40,16 @@ def described(per_place: int = PER_PLACE) -> DescribedPhotos:
     )
 
 
-def with_foreign(photos: DescribedPhotos, count: int = 20) -> DescribedPhotos:
+def with_foreign(photos: DescribedPhotos) -> DescribedPhotos:
     """The set with photos of elsewhere, which are unlike all of the map."""
     return replace(
         photos,
-        rows=np.concatenate([photos.rows, -photos.rows[:count]]),
-        locations=[*photos.locations, *[PhotoLocation(None, None, None)] * count],
-        captured_at=[*photos.captured_at, *[None] * count],
-        is_query=np.append(photos.is_query, np.zeros(count, dtype=bool)),
-        clusters=np.append(photos.clusters, 1000 + np.arange(count)),
-        foreign={"elsewhere": range(len(photos.rows), len(photos.rows) + count)},
+        rows=np.concatenate([photos.rows, -photos.rows[:20]]),
+        locations=[*photos.locations, *[PhotoLocation(None, None, None)] * 20],
+        captured_at=[*photos.captured_at, *[None] * 20],
+        is_query=np.append(photos.is_query, np.zeros(20, dtype=bool)),
+        clusters=np.append(photos.clusters, 1000 + np.arange(20)),
+        foreign={"elsewhere": range(len(photos.rows), len(photos.rows) + 20)},
     )
 
 
@@ -67,9 +66,7 @@ def test_without_a_folder_the_tower_of_the_test_data_is_measured(
 
     monkeypatch.setattr(estimates, "describe_sets", describe)
     monkeypatch.setenv("PLACEWISE_TEST_DATA", str(tmp_path))
-    output = (
-        CliRunner().invoke(build_app(["bench"]), ["bench", "estimates", "--splits", "1"]).output
-    )
+    output = run("bench", "estimates", "--splits", 1).output
     assert described_folders == [tmp_path / "tower"]
     assert "house, half of its queries labelled" in output
     assert "95 % interval" in output

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
-from typer.testing import CliRunner
 
 from lab.benchmarks import extract
-from services.cli.main import build_app
-
-runner = CliRunner()
-app = build_app(["bench"])
+from tests.support.commands import run_json
 
 
 def test_random_weights_are_named_and_the_passes_to_the_used_layer_counted(
@@ -20,9 +14,7 @@ def test_random_weights_are_named_and_the_passes_to_the_used_layer_counted(
     monkeypatch.setattr(extract, "MATRIX_SIZE", {"cpu": 64})
     monkeypatch.setattr(extract, "FIT_PHOTOS", 1)
     arguments = "--extractor anyloc-vits14:layer=1 --photos 2 --device cpu --batch 2 --rounds 1"
-    ended = runner.invoke(app, ["bench", "extract", *arguments.split(), "--json"])
-    assert ended.exit_code == 0
-    report = json.loads(ended.stdout)
+    report = run_json("bench", "extract", *arguments.split())
     assert "random weights" in report["title"]
     assert report["random_weights"]
     found = {figure["what"]: figure["measured"] for figure in report["figures"]}

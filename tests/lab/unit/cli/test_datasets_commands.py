@@ -3,35 +3,17 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
 from lab.datasets.open_dataset import open_evaluation_set
-from services.cli.main import build_app
 from tests.lab.unit.data_sets import save_lists, save_names, utm_name, write_csv, write_photos
+from tests.support.commands import run, run_json
 
-
-def run(*arguments: object, command: str = "datasets", code: int = 0) -> Result:
-    result = CliRunner().invoke(build_app([command]), [command, *map(str, arguments)])
-    assert result.exit_code == code, result.output
-    return result
-
-
-def called(*arguments: object, code: int = 0) -> str:
-    return run(*arguments, code=code).output
-
-
-def run_datasets(*arguments: object, code: int = 0) -> Any:
-    """The answer as a program gets it."""
-    return json.loads(run(*arguments, "--json", code=code).stdout)
-
-
-def evaluate(*arguments: object, code: int = 0) -> Any:
-    return json.loads(run(*arguments, "--json", command="evaluate", code=code).stdout)
+run_datasets = partial(run_json, "datasets")
 
 
 def street(base: Path, folder: str, metres: list[float]) -> list[str]:
@@ -60,7 +42,7 @@ def test_check_lists_what_the_folder_contains(tmp_path: Path) -> None:
     assert (one["database"], one["queries"], one["queries_without_positives"]) == (3, 2, 1)
     assert one["fingerprint"] == open_evaluation_set(tmp_path).fingerprint
     assert (reported["decoded"], reported["problems"]) == (True, [])
-    printed = called("check", tmp_path)
+    printed = run("datasets", "check", tmp_path).output
     for part in ("5 photos of 2 places in 2 cities", "osl", one["fingerprint"][:12], "25 m"):
         assert part in printed
 
@@ -84,7 +66,7 @@ def test_check_names_photos_that_are_listed_and_not_there(tmp_path: Path) -> Non
     (problem,) = run_datasets("check", tmp_path, code=1)["problems"]
     assert (problem["code"], problem["count"]) == ("missing_photo", 7)
     assert problem["examples"] == [str(tmp_path / f"{number}.jpg") for number in range(5)]
-    assert "and 2 more" in called("check", tmp_path, code=1)
+    assert "and 2 more" in run("datasets", "check", tmp_path, code=1).output
 
 
 def test_check_names_a_ground_truth_that_differs_from_the_positions(tmp_path: Path) -> None:

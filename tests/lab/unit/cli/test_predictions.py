@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from services.cli.main import build_app
+from tests.support.commands import run_json
 
+evaluate = partial(run_json, "evaluate")
 TRUTH = [[4, 2], [1], [], [3], [0, 5]]
 PREDICTED = [[4, 1, 2, 0, 3], [3, 0, 1, 2, 4], [5, 4, 3, 2, 1], [5, 4, 2, 1, 0], [5, 0, 1, 2, 3]]
 """right at rank 1, rank 3, nothing to find, nowhere, rank 1"""
@@ -27,18 +27,10 @@ def files(tmp_path: Path) -> tuple[Path, Path]:
     return tmp_path / "found.npy", tmp_path / "gt.npy"
 
 
-def run(*arguments: object, code: int = 0) -> dict[str, Any]:
-    given = ["evaluate", *map(str, arguments), "--json"]
-    result = CliRunner().invoke(build_app(["evaluate"]), given)
-    assert result.exit_code == code, result.output
-    answer: dict[str, Any] = json.loads(result.stdout)
-    return answer
-
-
 def test_recall_is_counted_over_all_queries_up_to_the_columns_that_are_there(
     files: tuple[Path, Path],
 ) -> None:
-    answer = run("--predictions", files[0], "--ground-truth", files[1])
+    answer = evaluate("--predictions", files[0], "--ground-truth", files[1])
     assert answer["recall"] == {"1": 2 / 5, "5": 3 / 5}
     assert answer["recall_findable"] == {"1": 2 / 4, "5": 3 / 4}
     assert answer["recall_curve"] == [0.4, 0.4, 0.6, 0.6, 0.6]
@@ -48,10 +40,10 @@ def test_recall_is_counted_over_all_queries_up_to_the_columns_that_are_there(
 
 def test_recall_is_reported_at_the_requested_numbers_of_photos(files: tuple[Path, Path]) -> None:
     given = ("--predictions", files[0], "--ground-truth", files[1])
-    answer = run(*given, "--recall-at", "3,1,2", "--depth", 5)
+    answer = evaluate(*given, "--recall-at", "3,1,2", "--depth", 5)
     assert answer["recall"] == {"1": 2 / 5, "2": 2 / 5, "3": 3 / 5}
     for bad in ("1,6", "0,1", "1,1", "one", ""):
-        problem = run(*given, "--recall-at", bad, "--depth", 5, code=1)
+        problem = evaluate(*given, "--recall-at", bad, "--depth", 5, code=1)
         assert problem["code"] == "bad_recall_at"
 
 
@@ -70,11 +62,11 @@ def test_file_that_is_no_predictions_of_these_queries_is_refused(
     tmp_path: Path, files: tuple[Path, Path], array: Any, code: str, message: str
 ) -> None:
     np.save(tmp_path / "bad.npy", array, allow_pickle=True)
-    problem = run("--predictions", tmp_path / "bad.npy", "--ground-truth", files[1], code=1)
+    problem = evaluate("--predictions", tmp_path / "bad.npy", "--ground-truth", files[1], code=1)
     assert problem["code"] == code
     assert message in problem["detail"]
     (tmp_path / "bad.npy").write_text("4 1 2")
-    problem = run("--predictions", tmp_path / "bad.npy", "--ground-truth", files[1], code=1)
+    problem = evaluate("--predictions", tmp_path / "bad.npy", "--ground-truth", files[1], code=1)
     assert problem["code"] == "bad_predictions"
 
 
@@ -89,7 +81,7 @@ def lists(folder: Path) -> list[object]:
 
 def test_lists_give_names_and_metres_to_a_report(tmp_path: Path, files: tuple[Path, Path]) -> None:
     out = tmp_path / "out"
-    answer = run(
+    answer = evaluate(
         "--predictions", files[0], "--ground-truth", files[1], "--out", out, *lists(tmp_path)
     )
     assert answer["distance_error"]["queries"] == 5
@@ -106,12 +98,12 @@ def test_runs_are_compared_query_by_query_where_their_ground_truth_is_the_same(
     tmp_path: Path, files: tuple[Path, Path]
 ) -> None:
     truth = ["--ground-truth", files[1]]
-    run("--predictions", files[0], *truth, "--out", tmp_path / "before")
+    evaluate("--predictions", files[0], *truth, "--out", tmp_path / "before")
     better = np.array(PREDICTED)
     better[[1, 3], 0] = [1, 3]  # won
     better[0, 0] = 5  # lost at rank 1
     np.save(tmp_path / "better.npy", better)
-    found = run(
+    found = evaluate(
         "--predictions", tmp_path / "better.npy", *truth, "--against", tmp_path / "before",
         "--out", tmp_path / "after",
     )["against"]  # fmt: skip
@@ -122,7 +114,7 @@ def test_runs_are_compared_query_by_query_where_their_ground_truth_is_the_same(
     other = np.empty(len(TRUTH), object)
     other[:] = [[4], [1], [], [3], [0, 5]]
     np.save(tmp_path / "gt.npy", other, allow_pickle=True)
-    problem = run("--predictions", files[0], *truth, "--against", tmp_path / "before", code=1)
+    problem = evaluate("--predictions", files[0], *truth, "--against", tmp_path / "before", code=1)
     assert problem["code"] == "runs_not_comparable"
 
 
@@ -148,4 +140,4 @@ def test_options_that_do_not_fit_together_are_refused(
     files: tuple[Path, Path], arguments: list[str], code: str
 ) -> None:
     filled = [argument.format(*files) for argument in arguments]
-    assert run(*filled, code=1)["code"] == code
+    assert evaluate(*filled, code=1)["code"] == code

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import utm
 from PIL import Image
-from PIL.ExifTags import GPS, IFD
 from scipy.io import savemat
 
 from lab.datasets.ground_truth_files import write_ground_truth
@@ -27,6 +26,7 @@ from tests.lab.unit.data_sets import (
     write_photo,
     write_photos,
 )
+from tests.support.photos import exif_with_position
 
 HEADER = "path,latitude,longitude,heading,place,frame,sequence"
 
@@ -99,18 +99,8 @@ def test_vme_compares_metres_of_different_zones(tmp_path: Path) -> None:
 
 
 def gps_photo(path: Path, latitude: float, longitude: float) -> None:
-    def parts(degrees: float) -> tuple[float, float, float]:
-        return int(degrees), int(degrees * 60) % 60, degrees * 3600 % 60
-
-    exif = Image.Exif()
-    exif[IFD.GPSInfo] = {
-        GPS.GPSLatitudeRef: "N",
-        GPS.GPSLatitude: parts(latitude),
-        GPS.GPSLongitudeRef: "E",
-        GPS.GPSLongitude: parts(longitude),
-    }
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.new("RGB", (8, 6)).save(path, exif=exif)
+    Image.new("RGB", (8, 6)).save(path, exif=exif_with_position(latitude, longitude))
 
 
 def test_photos_of_a_camera_have_the_position_of_their_exif(tmp_path: Path) -> None:

@@ -21,10 +21,10 @@ from lab.training.arguments import (
     to_plain_dict,
 )
 from lab.training.resolve import list_changed_meanings, make_fabric
-from services.cli.main import build_app
 from shared.errors import InvalidRequest
 from tests.lab.training_runs import PUBLISHED_COMMAND
 from tests.lab.unit.data_sets import refused
+from tests.support.commands import run
 
 PREDECESSORS: dict[str, Any] = {
     "backbone_arch": "resnet18",
@@ -190,13 +190,11 @@ def test_an_invalid_value_names_its_argument(name: str, text: str, message: str)
 
 
 def test_a_word_after_a_boolean_option_is_its_value() -> None:
-    answer = CliRunner().invoke(build_app(["train"]), ["train", "--shuffle_all", "maybe"])
-    assert answer.exit_code == 1
+    answer = run("train", "--shuffle_all", "maybe", code=1)
     shown = answer.output.replace("\n", " ")
     assert "--shuffle_all" in shown
     assert "Expected True or False (got 'maybe')" in shown
-    answer = CliRunner().invoke(build_app(["train"]), ["train", "--batchsize", "3"])
-    assert answer.exit_code == 2
+    answer = run("train", "--batchsize", "3", code=2)
     assert "--batch-size" in answer.output, "the nearest option is suggested"
 
 

@@ -15,8 +15,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import pyexiv2
 import pytest
-from PIL import Image
-from PIL.ExifTags import IFD, Base
+from PIL.ExifTags import Base
 from typer.testing import CliRunner, Result
 
 from services.cli.locate import folder as locate_folder
@@ -27,7 +26,7 @@ from services.cli.main import build_app
 from shared.errors import InvalidRequest
 from tests.support.api_responses import PHOTO, POSE, SIMILAR, STATS
 from tests.support.fake_server import FakeServer
-from tests.support.photos import encoded, exif_with_position, photo_image
+from tests.support.photos import camera_exif, encoded, photo_image
 
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
 LATITUDE, LONGITUDE = 45.0691, 7.6853
@@ -44,17 +43,12 @@ def photo(
     serial: str = "1",
 ) -> bytes:
     """A JPEG that was taken so many seconds after noon UTC; the camera's clock is two ahead."""
-    exif = Image.Exif()
-    if north_m is not None:
-        exif = exif_with_position(LATITUDE + north_m * DEGREES_PER_M, LONGITUDE)
-    exif[Base.Make], exif[Base.Model] = "Maker", camera
-    if serial:
-        exif.get_ifd(IFD.Exif)[Base.BodySerialNumber] = serial
-    if seconds is not None:
-        clock = NOON + timedelta(hours=2, seconds=seconds)
-        exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = f"{clock:%Y:%m:%d %H:%M:%S}"
-        if offset:
-            exif.get_ifd(IFD.Exif)[Base.OffsetTimeOriginal] = offset
+    position = None if north_m is None else (LATITUDE + north_m * DEGREES_PER_M, LONGITUDE)
+    clock = None if seconds is None else NOON + timedelta(hours=2, seconds=seconds)
+    exif = camera_exif(
+        clock, position, offset=offset if clock else None, model=camera, serial=serial
+    )
+    exif[Base.Make] = "Maker"
     return encoded(photo_image(1), "JPEG", exif=exif)
 
 

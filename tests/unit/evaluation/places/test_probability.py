@@ -383,14 +383,9 @@ def test_an_own_photo_that_is_alone_at_its_place_is_no_example_of_a_query_in_the
     assert (table.target == 0).sum() == 16
 
 
-def held_out(
-    probabilities: list[float],
-    right: list[bool | None],
-    not_in_map: float = 0.0,
-    left_out: str | None = None,
-) -> HeldOutEstimate:
+def held_out(probabilities: list[float], right: list[bool | None]) -> HeldOutEstimate:
     """The last level, that of the whole map, is added."""
-    return HeldOutEstimate([*probabilities, 1.0], not_in_map, [*right, True], left_out, 1.0)
+    return HeldOutEstimate([*probabilities, 1.0], 0.0, [*right, True], None, 1.0)
 
 
 def test_shared_neighbours_are_those_that_the_query_and_its_best_photo_find_first() -> None:
@@ -425,8 +420,8 @@ def test_a_place_model_of_other_levels_is_not_used() -> None:
 # --- fits ------------------------------------------------------------------------------------
 
 
-def sampler(places: int, per_place: int, noise: float, seed: int = 0) -> OwnPhotoSampler:
-    return town(places, per_place, noise, seed)[0]
+def sampler(places: int, per_place: int, noise: float) -> OwnPhotoSampler:
+    return town(places, per_place, noise)[0]
 
 
 def town(
@@ -474,9 +469,9 @@ def town(
 
 
 @functools.cache
-def own_samples(places: int = 40, per_place: int = 5, noise: float = 1.0) -> list[PlaceSample]:
-    own = sampler(places, per_place, noise)
-    photos = range(places * per_place)
+def own_samples(noise: float = 1.0) -> list[PlaceSample]:
+    own = sampler(40, 5, noise)
+    photos = range(200)
     return list(own.samples(photos, own.spread(photos)))
 
 
@@ -596,9 +591,9 @@ def test_labelled_queries_refine_the_place_model() -> None:
 # --- matches of local features -----------------------------------------------------------------
 
 
-def true_support(photo: int, others: Sequence[Any], *, per_place: int = 5) -> list[float]:
+def true_support(photo: int, others: Sequence[Any]) -> list[float]:
     """Many matches between photos of one place, and few between others."""
-    return [80.0 if photo // per_place == other // per_place else 4.0 for other in others]
+    return [80.0 if photo // 5 == other // 5 else 4.0 for other in others]
 
 
 def answered(evaluation: PlaceEvaluation) -> float:
