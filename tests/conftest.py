@@ -18,6 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import execnet
+import hypothesis
 import pytest
 from sqlalchemy.engine import make_url
 
@@ -54,6 +55,8 @@ COMPUTING = ("integration", "contract", "unit")
 # the CPU time of tests of the gateway.
 gc.set_threshold(50_000)
 share_compiled_statements()
+hypothesis.settings.register_profile("any processor", deadline=None)
+hypothesis.settings.load_profile("any processor")
 # Imports freeze their objects, of which triton would report hundreds as leaked at the end.
 atexit.register(gc.unfreeze)
 # A variable, the paths that are collected where it is set, and what to say where it is not.

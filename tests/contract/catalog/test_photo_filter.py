@@ -55,7 +55,6 @@ def in_scan(photos: list[PhotoFilterValues], photo_filter: PhotoFilter) -> set[U
 def test_sql_and_the_scan_let_pass_what_the_filter_means(catalog: Catalog, map_id: UUID) -> None:
     @settings(
         max_examples=8,
-        deadline=None,
         phases=[Phase.generate],  # shrinking would store thousands of populations
         suppress_health_check=list(HealthCheck),
     )

@@ -294,7 +294,6 @@ def found_by(worker: MilvusWorker, condition: str, circle: Circle | None) -> set
 @whatever_the_catalog
 @how(
     max_examples=40,
-    deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(data=some.data(), count=some.integers(1, 8))

@@ -145,7 +145,6 @@ def test_no_order_of_adding_deleting_and_merging_attaches_a_score_to_another_pho
         settings=how(
             max_examples=8,
             stateful_step_count=15,
-            deadline=None,
             suppress_health_check=list(HealthCheck),
         ),
     )

@@ -54,7 +54,6 @@ KEY = {"Authorization": f"Bearer {ADMIN}"}
 def settings_of(examples: int, **more: Any) -> hypothesis.settings:
     return hypothesis.settings(
         max_examples=examples,
-        deadline=None,
         database=None,
         derandomize=EXAMPLES <= 2,
         suppress_health_check=list(HealthCheck),

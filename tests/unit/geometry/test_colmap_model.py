@@ -158,9 +158,7 @@ def test_camera_of_an_unknown_model_is_refused(folder: Path, tmp_path: Path) -> 
     assert "99" in refused(tmp_path) or "PERIDOT" in refused(tmp_path)
 
 
-@settings(
-    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damaged_files_are_read_or_refused_and_nothing_else(
     folder: Path, tmp_path: Path, data: st.DataObject

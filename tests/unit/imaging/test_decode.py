@@ -325,7 +325,7 @@ def test_photos_with_broken_exif_are_decoded() -> None:
         assert decode_photo(data, SQUARE, PIXELS).pixels.shape == (32, 32, 3)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), media=st.sampled_from(sorted(FORMATS)))
 def test_damaged_photos_decode_or_are_refused_and_raise_nothing_else(seed: int, media: str) -> None:
     rng = random.Random(seed)

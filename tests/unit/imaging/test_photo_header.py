@@ -224,7 +224,7 @@ def whole_exif() -> bytes:
     return data
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(seed=st.integers(0, 2**32 - 1), media=st.sampled_from(["JPEG", "PNG", "WEBP"]))
 def test_photos_with_damaged_exif_are_accepted(seed: int, media: str) -> None:
     rng = random.Random(seed)

@@ -56,7 +56,7 @@ def scan(
     return answer(snapshot, query, row_mask, k)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**31),
     count=st.integers(1, 40),

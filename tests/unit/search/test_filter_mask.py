@@ -24,7 +24,7 @@ def selected(photos: list[PhotoFilterValues], photo_filter: PhotoFilter) -> list
     return list(columns.photo_id[build_row_mask(columns, photo_filter, ())])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(data=some.data(), count=some.integers(1, 12))
 def test_filter_mask_selects_the_photos_that_match_the_filter(
     data: some.DataObject, count: int
@@ -39,7 +39,7 @@ def test_filter_mask_selects_the_photos_that_match_the_filter(
             assert (photo.photo_id in found) == (expected and findable), (photo, photo_filter)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(data=some.data())
 def test_filter_mask_leaves_out_excluded_deleted_and_query_photos(data: some.DataObject) -> None:
     photos = [data.draw(photo_facts(photo_id)) for photo_id in IDS[:6]]

@@ -41,7 +41,7 @@ def by_codes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(executor, "sign_codes_pay_off", lambda selected, k: True)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(case=cases(DIMENSION))
 def test_answers_equal_brute_force_with_order_and_ties(case: Case) -> None:
     snapshot = snapshot_of(case.rows, case.pieces)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import utm
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lab.datasets.dataset import DatasetPhoto
@@ -54,7 +54,6 @@ spots = st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 2000)), min_size
 
 
 @given(spots, spots, st.sampled_from([0.0, 0.1, 5.0, 25.0, 60.0, 500.0]))
-@settings(deadline=None)
 def test_positives_are_those_of_the_full_matrix(
     query_positions: list[tuple[int, int]],
     database_positions: list[tuple[int, int]],
@@ -109,7 +108,6 @@ def test_equator_and_antimeridian_part_no_neighbours() -> None:
     st.floats(-180, 180),
     st.lists(st.tuples(st.floats(-3e-4, 3e-4), st.floats(-3e-4, 3e-4)), min_size=1, max_size=12),
 )
-@settings(deadline=None)
 def test_positives_over_zones_agree_with_distances_on_the_earth(
     latitude: float, longitude: float, steps: list[tuple[float, float]]
 ) -> None:

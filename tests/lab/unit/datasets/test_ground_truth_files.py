@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lab.datasets.ground_truth_files import (
@@ -45,7 +45,6 @@ def rows_of(path: Path) -> list[list[int]]:
 
 
 @given(st.lists(st.lists(st.integers(0, 2**40), unique=True)))
-@settings(deadline=None)
 def test_written_files_are_read_by_numpy_and_by_the_reader(
     tmp_path_factory: pytest.TempPathFactory, rows: list[list[int]]
 ) -> None:
@@ -124,7 +123,6 @@ def test_other_things_than_lists_of_indices_are_refused(tmp_path: Path, value: o
 
 
 @given(st.binary(max_size=80))
-@settings(deadline=None)
 def test_corrupt_files_are_an_explained_error(
     tmp_path_factory: pytest.TempPathFactory, end: bytes
 ) -> None:

@@ -64,7 +64,7 @@ def test_an_empty_cluster_takes_the_point_that_its_own_centre_describes_worst() 
         assert torch.equal(walk(points, nobody, batch).end(nobody)[1], points[2])
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), clusters=st.integers(1, 12), copies=st.integers(1, 4))
 def test_no_cluster_is_left_empty_when_there_are_enough_distinct_points(
     seed: int, clusters: int, copies: int
