@@ -26,6 +26,11 @@ NEW_TO_THE_MAP = (
     "them with their places as labelled queries."
 )
 
+LOOK_ALIKE = (
+    "Places of this map look alike: where it lacks theirs, {} of its photos get a wrong answer. It "
+    "may lack the place of this one."
+)
+
 
 def locate_hits(hits: Sequence[SearchHit], photos: Mapping[UUID, Photo]) -> list[RankedPhoto]:
     """Join hits with the locations of their photos."""
@@ -92,10 +97,13 @@ def estimate_place(
         calibration_source=estimate.model.calibration_source,
     )
     worded = _in_words(response)
-    if not is_new:
-        return worded
-    reason = f"{worded.reason} {NEW_TO_THE_MAP}"
-    return worded.model_copy(update={"new_to_map": True, "reason": reason})
+    reasons = [worded.reason]
+    mistaken = estimate.model.mistaken_share(certainty)
+    if estimate.answer is not None and mistaken > 1 - certainty:
+        reasons.append(LOOK_ALIKE.format(_percent(mistaken)))
+    if is_new:
+        reasons.append(NEW_TO_THE_MAP)
+    return worded.model_copy(update={"new_to_map": is_new, "reason": " ".join(reasons)})
 
 
 def place_at_pose(estimate: EstimateResponse, pose: CameraPoseResponse) -> EstimateResponse:

@@ -126,8 +126,16 @@ def fit_place_model(
             "best_scores": tuple(quantiles.round(4).tolist()),
         }
     )
+    mistaken = [[_is_mistaken(model, s, each) for s in impostors] for each in CERTAINTIES]
+    if impostors:
+        model = model.model_copy(update={"mistaken": tuple(np.mean(mistaken, axis=1).tolist())})
     in_map = labelled_held_out or [s for s in own_held_out if s.left_out is None]
     return FittedPlaceModel(model, in_map, impostors)
+
+
+def _is_mistaken(model: PlaceModel, estimate: HeldOutEstimate, certainty: float) -> bool:
+    answer = model.answer(estimate.probabilities, estimate.not_in_map, certainty)
+    return answer is not None and estimate.is_right[answer] is False
 
 
 def _fit_coefficients(

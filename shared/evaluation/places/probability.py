@@ -241,6 +241,9 @@ class PlaceModel(BaseModel):
     extent: MapExtent = MapExtent()
     thresholds: tuple[float, ...] = ()
     """least probability of an answer, for each of CERTAINTIES"""
+    mistaken: tuple[float, ...] = ()
+    """share of own photos that get a wrong answer where the map lacks their place, for each of
+    CERTAINTIES"""
     best_scores: tuple[float, ...] = ()
     """quantiles of the score of the best photo, of the queries that the model was fitted on"""
     wrong_until: tuple[float, ...] = ()
@@ -334,8 +337,7 @@ class PlaceModel(BaseModel):
             Unprocessable: `too_few_labelled_queries` for the guarantee.
         """
         if guarantee is None:
-            stored = zip(CERTAINTIES, self.thresholds, strict=False)
-            return next((t for known, t in stored if known >= certainty - 1e-9), certainty)
+            return _at_certainty(self.thresholds, certainty, certainty)
         least = guaranteed_threshold(self.wrong_until, guarantee)
         if least is None:
             needed = max(MIN_LABELLED_QUERIES, math.ceil(1 / guarantee - 1 - 1e-9))
@@ -347,6 +349,13 @@ class PlaceModel(BaseModel):
                 needed=needed,
             )
         return least
+
+    def mistaken_share(self, certainty: float) -> float:
+        """Return the share of own photos that get a wrong answer where the map lacks their place.
+
+        It is what look-alikes can do that the map itself shows, such as floors built alike.
+        """
+        return _at_certainty(self.mistaken, certainty, 0.0)
 
     def is_new(self, recent: Sequence[float]) -> bool:
         """Return whether queries are new to the map, by the scores of their best photos."""
@@ -473,6 +482,12 @@ def _match_probabilities(
     others = np.minimum(remaining * shares, probability)
     matches: list[float] = np.where(inside, probability, others).tolist()
     return matches
+
+
+def _at_certainty(values: Sequence[float], certainty: float, otherwise: float) -> float:
+    """Return the value of the next higher of CERTAINTIES."""
+    stored = zip(CERTAINTIES, values, strict=False)
+    return next((value for known, value in stored if known >= certainty - 1e-9), otherwise)
 
 
 def _log_odds(coefficients: Coefficients, level: CandidateLevel) -> float:

@@ -133,6 +133,7 @@ def test_a_query_is_in_the_map_elsewhere_or_neither_is_certain() -> None:
     pose_m=st.none() | st.floats(0.1, 3000),
     threshold=st.none() | st.floats(0.75, 1.0),
     wrong_until=st.none() | st.lists(st.floats(0.0, 1.0), min_size=40, max_size=40),
+    mistaken=st.floats(0.0, 1.0),
     is_new=st.booleans(),
 )
 def test_headline_levels_and_fields_of_an_estimate_agree(
@@ -142,12 +143,16 @@ def test_headline_levels_and_fields_of_an_estimate_agree(
     pose_m: float | None,
     threshold: float | None,
     wrong_until: list[float] | None,
+    mistaken: float,
     is_new: bool,
 ) -> None:
     thresholds = () if threshold is None else (threshold,) * len(CERTAINTIES)
     guarantee = None if wrong_until is None else 0.05
     model = PlaceModel(
-        source="own_photos", thresholds=thresholds, wrong_until=tuple(wrong_until or ())
+        source="own_photos",
+        thresholds=thresholds,
+        wrong_until=tuple(wrong_until or ()),
+        mistaken=(mistaken,) * len(CERTAINTIES),
     )
     last = len(probabilities) - 1
     levels = [
@@ -192,7 +197,10 @@ def test_headline_levels_and_fields_of_an_estimate_agree(
         assert all(p < max(least, 0.95) for p in stated[: told.answer_level])
     assert (told.in_map is True) is (told.answer_level is not None)
     assert told.new_to_map is is_new
-    assert ("new to this map" in told.reason) is (is_new and (pose_m is None or of_labels))
+    of_evidence = pose_m is None or of_labels
+    assert ("new to this map" in told.reason) is (is_new and of_evidence)
+    warned = told.answer_level is not None and mistaken > 1 - certainty and of_evidence
+    assert ("look alike" in told.reason) is warned
     if told.in_map is False:
         assert (told.latitude, told.place, told.radius_m, told.confidence) == (None,) * 4
         assert told.answer_level is None

@@ -425,9 +425,11 @@ def sampler(places: int, per_place: int, noise: float) -> OwnPhotoSampler:
 
 
 def town(
-    places: int, per_place: int, noise: float, seed: int = 0
+    places: int, per_place: int, noise: float, seed: int = 0, kinds: int | None = None
 ) -> tuple[OwnPhotoSampler, MapScores, list[tuple[list[RankedPhoto], PhotoLocation]]]:
     """A map of places on floors, whose photos are points around a centre for each place.
+
+    Places of one of the `kinds`, if any, look alike.
 
     Returns:
         The map; what is known of its scores; and queries, two of each place and two of each of as
@@ -435,6 +437,8 @@ def town(
     """
     rng = np.random.default_rng(seed)
     centres = rng.normal(size=(places, 16))
+    if kinds is not None:
+        centres = centres[np.arange(places) % kinds] + 0.3 * centres
 
     def photos(around: FloatArray, each: int) -> FloatArray:
         points = np.repeat(around, each, 0)
@@ -491,6 +495,19 @@ def test_held_out_photos_have_the_observed_probabilities_and_few_impostors_get_a
         assert answers["impostors_at_finest_level"] <= 1 - answers["certainty"] + 0.02
     assert shares == sorted(shares, reverse=True)
     assert shares[0] > 0.2
+
+
+def test_model_knows_how_often_a_place_that_it_lacks_is_taken_for_one_that_looks_alike() -> None:
+    def mistaken(kinds: int | None) -> list[float]:
+        own, scores, _ = town(40, 5, 0.15, kinds=kinds)
+        samples = [*own.samples(range(200), own.spread(range(200)))]
+        model = fit_place_model(samples, [], PATHS, scores).model
+        return [model.mistaken_share(certainty) for certainty in (0.5, 0.8, 0.95)]
+
+    alike, different = mistaken(20), mistaken(None)
+    assert alike[0] > 2 * different[0] > 0
+    assert different == sorted(different, reverse=True)
+    assert PlaceModel().mistaken_share(0.8) == 0.0
 
 
 @pytest.mark.parametrize(
