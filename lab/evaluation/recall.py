@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 POSITIVE_WITHIN_M = 25.0
 
@@ -29,6 +28,8 @@ def positives_within(
     """
     if not len(database):
         return [np.empty(0, np.int64) for _ in queries]
+    from scipy.spatial import cKDTree  # not a package of `make run`, with which cities are drawn
+
     # The tree compares squares, as those of published ground truths do: a root would round.
     found = cKDTree(database).query_ball_point(queries, within_m, return_sorted=True)
     return [np.array(rows, np.int64) for rows in found]

@@ -83,11 +83,16 @@ def require_packages(*names: str) -> None:
     """
     missing = [name for name in names or ("faiss", "torch") if find_spec(name) is None]
     if missing:
-        raise Misconfigured(
-            "lab_missing",
-            f"This command requires {', '.join(missing)}. "
-            "Run `make setup`, or in the repository: uv pip install '.[lab]'.",
-        )
+        raise packages_missing(*missing)
+
+
+def packages_missing(*names: str) -> Misconfigured:
+    """Return the error `lab_missing` for packages that `make run` does not install."""
+    return Misconfigured(
+        "lab_missing",
+        f"This command requires {', '.join(names)}. "
+        "Run `make setup`, or in the repository: uv pip install '.[lab]'.",
+    )
 
 
 def lab_missing(what: str) -> Misconfigured:

@@ -12,6 +12,7 @@ import logging
 import sys
 from collections.abc import Collection
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -116,9 +117,13 @@ class _PlacewiseGroup(_ListingGroup):
         try:
             return super().invoke(ctx)
         except Exception as error:
+            from services.cli.environment import packages_missing
             from services.cli.output import AS_JSON, report_error  # the help does not need rich
 
-            if report_error(error, ctx.meta.get(AS_JSON, False)):
+            package = (getattr(error, "name", None) or "").partition(".")[0]
+            is_missing = isinstance(error, ModuleNotFoundError) and find_spec(package) is None
+            reported = packages_missing(package) if is_missing else error
+            if report_error(reported, ctx.meta.get(AS_JSON, False)):
                 raise typer.Exit(1) from error
             raise
 
