@@ -27,8 +27,8 @@ NEW_TO_THE_MAP = (
 )
 
 LOOK_ALIKE = (
-    "Places of this map look alike: where it lacks theirs, {} of its photos get a wrong answer. It "
-    "may lack the place of this one."
+    "Places of this map look alike: {} of its photos get a wrong answer when their own place is "
+    "taken out of it, and it may lack the place of this one."
 )
 
 
