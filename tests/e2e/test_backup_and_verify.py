@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from tests.support.metrics import read
 from tests.support.photos import photo_bytes
-from tests.support.server import ServerProcess, environment, run_command
+from tests.support.server import CommandLine, ServerProcess
 
 
 def run(server_or_home: Path, *arguments: str | Path, code: int = 0) -> Any:
-    done = run_command(
-        *arguments, "--json", env=environment(server_or_home), cwd=server_or_home.parent
-    )
-    assert done.returncode == code, done.stdout + done.stderr
-    return json.loads(done.stdout)
+    return CommandLine(server_or_home.parent, server_or_home)(*arguments, "--json").json(code)
 
 
 def test_a_running_server_is_backed_up_and_another_one_answers_as_it_did(

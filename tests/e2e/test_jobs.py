@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import time
 from typing import Any
 from uuid import uuid4
@@ -12,7 +11,7 @@ import httpx2
 
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
-from tests.support.server import ServerProcess, environment, run_command
+from tests.support.server import CommandLine, ServerProcess
 
 # One photo per batch, so that of several photos only the first ones are under way.
 SETTINGS = {"batch_photos": 1}
@@ -58,26 +57,19 @@ def test_a_job_has_its_times_progress_and_result(server: ServerProcess) -> None:
 def test_the_command_names_failed_photos_with_the_reason_and_retries_them(
     server: ServerProcess,
 ) -> None:
-    def jobs(*options: str) -> list[dict[str, Any]]:
-        ran = run_command(
-            "jobs", *options, "--json", env=environment(server.home), cwd=server.home.parent
-        )
-        assert ran.returncode == 0, ran.stderr
-        found: list[dict[str, Any]] = json.loads(ran.stdout)
-        return found
-
+    placewise = CommandLine(server.home.parent, server.home)
     broken = server.upload(photo_bytes(next(fresh))[:-60], "cut-off.jpg").json()["job_id"]
     assert server.finished(broken)["state"] == "failed"
-    failed = jobs("--failed")
+    failed = placewise("jobs", "--failed", "--json").json()
     assert {job["state"] for job in failed} == {"failed"}
     assert (failed[0]["filename"], failed[0]["map"]) == ("cut-off.jpg", "default")
     assert failed[0]["error"]["code"] == "undecodable_photo"
-    table = run_command("jobs", env=environment(server.home), cwd=server.home.parent).stdout
-    (row,) = [line for line in table.splitlines() if "cut-off.jpg" in line]
+    table = placewise("jobs").stdout.splitlines()
+    (row,) = [line for line in table if "cut-off.jpg" in line]
     assert row.startswith("failed\tcut-off.jpg\tindex\t")
     assert failed[0]["error"]["detail"] in row
 
-    (retried,) = jobs("--retry", "--limit", "1")
+    (retried,) = placewise("jobs", "--retry", "--limit", "1", "--json").json()
     assert (retried["job_id"], retried["state"]) == (broken, "queued")
     assert server.finished(broken)["state"] == "failed", "it is as broken as before"
 

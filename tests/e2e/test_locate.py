@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
 from datetime import datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,7 @@ from tests.support.photos import (
     photo_image,
     sidecar_position,
 )
-from tests.support.server import ServerProcess, environment, run_command
+from tests.support.server import CommandLine, ServerProcess
 
 NOON = datetime(2026, 5, 1, 12)  # noqa: DTZ001 the clock of a camera
 DEGREES_APART = 0.001
@@ -50,12 +49,8 @@ def test_a_folder_is_located_by_the_map_and_by_time_written_and_undone(
     (trip / "empty.jpg").touch()
     before = {path.name: path.read_bytes() for path in trip.iterdir()}
 
-    def locate(*options: str) -> subprocess.CompletedProcess[str]:
-        return run_command("locate", "trip", *options, env=environment(server.home), cwd=tmp_path)
-
-    run = locate("--accept", "0.9", "--json")
-    assert run.returncode == 1, "a photo could not be read"
-    answer = json.loads(run.stdout)
+    locate = partial(CommandLine(tmp_path, server.home), "locate", "trip")
+    answer = locate("--accept", "0.9", "--json").json(1)  # a photo could not be read
     assert (answer["photos"], answer["with_coordinates"]) == (5, 1)
     proposals = {each["filename"]: each for each in answer["proposals"]}
     assert "its header is cut off" in proposals["broken.jpg"]["error"]
@@ -73,10 +68,10 @@ def test_a_folder_is_located_by_the_map_and_by_time_written_and_undone(
         (trip / unreadable).unlink()
         del before[unreadable]
     written = locate("--accept", "0.9", "--write")
-    assert written.returncode == 0, written.stderr
+    assert written.code == 0, written.stderr
     assert "of the map.jpg" in written.stdout
     position = sidecar_position((trip / "of the map.jpg.xmp").read_bytes())
     assert position == pytest.approx((by_both["position"]["latitude"], LONGITUDE), abs=1e-4)
     undone = locate("--undo")
-    assert undone.returncode == 0, undone.stderr
+    assert undone.code == 0, undone.stderr
     assert {path.name: path.read_bytes() for path in trip.iterdir()} == before

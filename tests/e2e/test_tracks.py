@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -12,7 +11,7 @@ import pytest
 import placewise
 from shared.config.embedded_home import find_running_server
 from tests.support.photos import photo_bytes
-from tests.support.server import ServerProcess, environment, run_command
+from tests.support.server import CommandLine, ServerProcess
 
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
 STREET = range(1, 6)
@@ -45,26 +44,17 @@ def test_a_folder_of_photos_becomes_a_track_and_its_files(
         (tmp_path / "ride" / f"{number}.jpg").write_bytes(photo_bytes(number))
     (tmp_path / "ride" / "4.jpg").write_bytes(photo_bytes(4)[:300])
     options = ["--every", "10", "--max-speed", "20"]
-    run = run_command(
-        *("track", "ride", *options, "--out=ride.gpx", "--json"),
-        env=environment(server.home),
-        cwd=tmp_path,
-    )
-    assert run.returncode == 0, run.stderr
+    command = CommandLine(tmp_path, server.home)
+    run = command("track", "ride", *options, "--out=ride.gpx", "--json")
+    track = run.json()
     assert "4.jpg" in run.stderr, "the photo that can't be read is named"
-    track = json.loads(run.stdout)
     statuses = [frame["status"] for frame in track["frames"]]
     assert statuses == ["applied"] * 3
     assert track["frames"][2]["state"]["latitude"] == pytest.approx(3 * DEGREES_APART, abs=1e-4)
     assert (tmp_path / "ride.gpx").stat().st_size > 100
-    table = run_command(
-        "track", "ride", *options, env=environment(server.home), cwd=tmp_path
-    ).stdout
-    assert "tracking" in table
-    refused = run_command(
-        "track", "ride", "--motion", "swim", env=environment(server.home), cwd=tmp_path
-    )
-    assert (refused.returncode, "invalid_field" in refused.stderr) == (1, True)
+    assert "tracking" in command("track", "ride", *options).stdout
+    refused = command("track", "ride", "--motion", "swim")
+    assert (refused.code, "invalid_field" in refused.stderr) == (1, True)
     assert len(list(street.tracks())) == 2
     street.delete_track(track["track_id"])
     assert len(list(street.tracks())) == 1

@@ -76,7 +76,7 @@ def test_images_that_describe_photos_load_xfeat_and_nothing_that_its_package_req
     assert run_python(image(service), tmp_path, LOAD_XFEAT).startswith("xfeat@")
 
 
-def run_python(image: Image, home: Path, *code: str) -> str:
+def run_python(image: Image, home: Path, *code: str, exits: int = 0) -> str:
     """What the program writes, run with these arguments in the environment of an image."""
     done = subprocess.run(
         [image.python, "-c", *code],
@@ -86,8 +86,8 @@ def run_python(image: Image, home: Path, *code: str) -> str:
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stderr[-1500:]
-    return done.stdout
+    assert done.returncode == exits, done.stderr[-1500:]
+    return done.stdout + done.stderr
 
 
 def test_no_image_holds_a_tool_of_the_developers(image: BuildImage) -> None:
@@ -101,15 +101,6 @@ def test_no_image_holds_a_tool_of_the_developers(image: BuildImage) -> None:
 
 def test_an_image_holds_no_lab_and_its_commands_say_so(image: BuildImage, tmp_path: Path) -> None:
     """Of one image: the context of all builds has no lab."""
-    gateway = image("gateway")
-    done = subprocess.run(
-        [gateway.python, "-c", f"from services.cli import main; {LAB_COMMAND}"],
-        cwd=tmp_path,
-        env=gateway.environment(tmp_path),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 1, done.stderr[-1500:]
-    said = " ".join(done.stderr.split())
-    assert "lab_missing: `placewise train` is part of the lab" in said
+    code = f"from services.cli import main; {LAB_COMMAND}"
+    said = run_python(image("gateway"), tmp_path, code, exits=1)
+    assert "lab_missing: `placewise train` is part of the lab" in " ".join(said.split())

@@ -12,19 +12,14 @@ from services.cli.output import Table, print_message, print_table, progress_bar
 
 LONG_PATH = "queries/midrise/" + "very-" * 20 + "long/frame_000123.jpg"
 MAP = "the-map-of-the-whole-building-with-all-its-floors-2026"
+EXTRACTOR = "efficientnet-lite0-vlad128:clusters=256"
+HEAD = ["map", "photos", "extractor", "vocabulary", "dimension", "photo"]
+ROW = [MAP, "1234567", EXTRACTOR, "foreign", "512 (PCA of 14336)", LONG_PATH]
 
 
 def make_table() -> Table:
-    table = Table("map", "photos", "extractor", "vocabulary", "dimension", "photo", "")
-    table.add_row(
-        MAP,
-        "1234567",
-        "efficientnet-lite0-vlad128:clusters=256",
-        "foreign",
-        "512 (PCA of 14336)",
-        LONG_PATH,
-        ProgressBar(total=1, completed=0.5, width=4),
-    )
+    table = Table(*HEAD, "")
+    table.add_row(*ROW, ProgressBar(total=1, completed=0.5, width=4))
     return table
 
 
@@ -41,7 +36,7 @@ def test_long_names_continue_below_to_fit_80_columns(capsys: pytest.CaptureFixtu
     assert max(map(len, lines)) <= 80
     first = next(number for number, line in enumerate(lines) if "1234567" in line)
     assert " foreign " in lines[first]
-    for name in (MAP, "efficientnet-lite0-vlad128:clusters=256", LONG_PATH):
+    for name in (MAP, EXTRACTOR, LONG_PATH):
         begin = lines[first].index(name[:8])
         below = "".join(line[begin:].split(" ")[0] for line in lines[first:])
         assert below == name, "each name is whole"
@@ -86,22 +81,8 @@ def test_output_that_is_no_terminal_is_tab_separated_with_full_names(
 ) -> None:
     print_table(make_table())
     head, row = capsys.readouterr().out.splitlines()
-    assert head.split("\t") == [
-        "map",
-        "photos",
-        "extractor",
-        "vocabulary",
-        "dimension",
-        "photo",
-    ], "the column of bars, which has no header, is left out"
-    assert row.split("\t") == [
-        MAP,
-        "1234567",
-        "efficientnet-lite0-vlad128:clusters=256",
-        "foreign",
-        "512 (PCA of 14336)",
-        LONG_PATH,
-    ]
+    assert head.split("\t") == HEAD, "the column of bars, which has no header, is left out"
+    assert row.split("\t") == ROW
 
 
 def test_tab_separated_cells_hold_no_markup_tabs_or_line_breaks(
