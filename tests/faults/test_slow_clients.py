@@ -57,7 +57,8 @@ def test_calls_are_answered_while_others_are_slow_and_limits_answer_by_name(
         log_bytes = server.log_path.stat().st_size
         poll = f"GET {job['status_url']}?wait=60 HTTP/1.1"
 
-        idle = [held.enter_context(connect(server, "127.0.0.1")) for _ in range(IDLE)]
+        for _ in range(IDLE):  # from its own address, the client's connection would be closed, too
+            held.enter_context(connect(server, "127.0.0.4"))
         bodies = [held.enter_context(connect(server, "127.0.0.2", upload)) for _ in range(BODIES)]
         polls = [held.enter_context(connect(server, "127.0.0.3", poll)) for _ in range(POLLS)]
         for number in range(10):
@@ -69,7 +70,6 @@ def test_calls_are_answered_while_others_are_slow_and_limits_answer_by_name(
         text = server.client.get("/metrics").text
         assert 'connections_closed_total{reason="address_limit"}' in text
         assert 'connections_closed_total{reason="accept_error"} 0.0' in text
-        assert len(idle) == IDLE
         assert server.log_path.stat().st_size - log_bytes < 100_000
         assert "Traceback" not in server.log()
 
