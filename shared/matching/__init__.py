@@ -1,5 +1,5 @@
 """Local features: keypoints with descriptors, their matches, and the verification of matches.
 
-`features` is the stored form, `xfeat` computes it (torch), `matchers` pairs the keypoints of two
-photos (NumPy), and `verification` tells which pairs agree with one camera motion.
+`features` is the stored form, `xfeat` computes it (torch), `mutual_nearest` pairs the keypoints of
+two photos (NumPy), and `verification` tells which pairs agree with one camera motion.
 """
