@@ -95,24 +95,6 @@ TimeZoneOption = Annotated[
         help="Time zone of photos whose EXIF has none, such as +02:00 or Europe/Paris.",
     ),
 ]
-ServerOption = Annotated[
-    str | None,
-    typer.Option(
-        "--server",
-        envvar="PLACEWISE_SERVER",
-        help="URL of a Placewise server. Default: the server on PLACEWISE_HOME.",
-    ),
-]
-
-KeyOption = Annotated[
-    str | None,
-    typer.Option(
-        "--key",
-        envvar="PLACEWISE_KEY",
-        help="API key. Prefer the environment variable: other users of this machine can see "
-        "command-line options. Not required for the server on PLACEWISE_HOME.",
-    ),
-]
 
 
 def utf8_path(path: Path) -> str:

@@ -11,12 +11,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Column
 
 from placewise.answers import CameraPose, Estimate, Matches
-from services.cli.client import connect, describe_target
+from services.cli.client import MapOptions
 from services.cli.output import (
-    JsonOption,
-    KeyOption,
-    MapOption,
-    ServerOption,
     Table,
     format_percent,
     print_json,
@@ -34,6 +30,7 @@ CALIBRATION_SOURCES = {
 
 
 def query(
+    common: MapOptions,
     photo: Annotated[Path, typer.Argument(metavar="PHOTO", exists=True, dir_okay=False)],
     top_k: Annotated[int, typer.Option(min=1, max=100, help="Maximum number of results.")] = 10,
     min_score: Annotated[
@@ -108,13 +105,9 @@ def query(
             "labelled queries."
         ),
     ] = None,
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Find the indexed photos most similar to PHOTO. The query photo is not stored."""
-    with connect(server, map_name, key) as client:
+    with common.connect() as client:
         answer = client.similar(
             photo,
             top_k=top_k,
@@ -134,8 +127,8 @@ def query(
             elsewhere=elsewhere,
             guarantee=guarantee,
         )
-        target = describe_target(client, server, map_name)
-    if as_json:
+        target = common.describe_target(client)
+    if common.as_json:
         print_json(answer)
         return
     levels = answer.estimate.levels

@@ -15,14 +15,12 @@ from rich.markup import escape
 from rich.table import Column
 
 from placewise.protocol import printable_name
-from services.cli.client import connect, wait_for_job
+from services.cli.client import MapOptions, ServerOptions, wait_for_job
 from services.cli.descriptors.local_weights import inspect_weights, list_extractor_configs
 from services.cli.environment import read_settings
+from services.cli.option_groups import CommandGroup
 from services.cli.output import (
     JsonOption,
-    KeyOption,
-    MapOption,
-    ServerOption,
     Table,
     print_json,
     print_message,
@@ -35,11 +33,12 @@ from shared.extractor_config.configs import get_extractor_config
 
 EXPORTED_NETWORK = {"backbone_arch": "exported", "agg_arch": ""}  # nothing else is known of it
 
-app = typer.Typer(help="Manage extractor weights and trained models.")
+app = CommandGroup(help="Manage extractor weights and trained models.")
 
 
 @app.command("add")
 def add(
+    common: MapOptions,
     checkpoint: Annotated[
         Path,
         typer.Argument(
@@ -69,17 +68,13 @@ def add(
         str | None, typer.Option("--licence", help="Licence of the weights.")
     ] = None,
     note: Annotated[str | None, typer.Option("--note", help="Free-text note.")] = None,
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Upload a checkpoint, TorchScript or ONNX file as an extractor for maps.
 
     The server's extractor validates the file and stores only what is needed to describe photos.
     `--map` only selects the map whose job list shows the job.
     """
-    with connect(server, map_name, key) as client, progress_bar() as progress:
+    with common.connect() as client, progress_bar() as progress:
         client.models()  # fails before the upload if the URL or key is wrong
         with progress.open(checkpoint, "rb", description="uploading (bytes)") as file:
             started = client.add_model(
@@ -94,7 +89,7 @@ def add(
     model = job.result or {}
     print_result(
         job,
-        as_json,
+        common.as_json,
         f"{model['extractor']}: {model['dimension']} dimensions, "
         f"{model['size_bytes'] / 1e6:.1f} MB, fingerprint {model['fingerprint'][:12]}"
         f"{'; already stored' if model['already_there'] else ''}.",
@@ -102,13 +97,11 @@ def add(
 
 
 @app.command("added")
-def list_added(
-    server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False
-) -> None:
+def list_added(common: ServerOptions) -> None:
     """List added models and the maps that use them."""
-    with connect(server, None, key) as client:
+    with common.connect() as client:
         models = client.models()
-    if as_json:
+    if common.as_json:
         print_json(models)
         return
     name = Column("extractor", overflow="fold", min_width=12)
@@ -129,17 +122,15 @@ def list_added(
 
 @app.command("remove")
 def remove(
+    common: ServerOptions,
     name: Annotated[
         str, typer.Argument(metavar="NAME", help="Name of an added model; see `models added`.")
     ],
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Remove a model that no map uses. Its name can't be reused for other weights."""
-    with connect(server, None, key) as client:
+    with common.connect() as client:
         removed = client.remove_model(name)
-    print_result(removed, as_json, removed.message)
+    print_result(removed, common.as_json, removed.message)
 
 
 @app.command("list")
