@@ -156,27 +156,34 @@ def _anyloc_config(
     )
 
 
+_EFFICIENTNET = ExtractorConfig(
+    name="efficientnet-lite0-vlad",
+    backbone="efficientnet-lite0",
+    implementation="efficientnet_lite0:EfficientNetLite0",
+    width=112,
+    parameters=5_000_000,
+    preprocessing="square224",
+    aggregator="vlad",
+    shipped_vocabulary="efficientnet-lite0.npy",
+)
+_TINY = ExtractorConfig(
+    name="test-tiny-avg",
+    backbone="test-tiny",
+    implementation="synthetic:TinyBackbone",
+    width=16,
+    parameters=1_000,
+    preprocessing="square32",
+    aggregator="avg",
+    for_tests=True,
+)
 EXTRACTOR_CONFIGS = {
     config.name: config
     for config in (
-        ExtractorConfig(
-            name="efficientnet-lite0-vlad",
-            backbone="efficientnet-lite0",
-            implementation="efficientnet_lite0:EfficientNetLite0",
-            width=112,
-            parameters=5_000_000,
-            preprocessing="square224",
-            aggregator="vlad",
-            shipped_vocabulary="efficientnet-lite0.npy",
-        ),
-        ExtractorConfig(
+        _EFFICIENTNET,
+        replace(
+            _EFFICIENTNET,
             name="efficientnet-lite0-vlad128",
-            backbone="efficientnet-lite0",
-            implementation="efficientnet_lite0:EfficientNetLite0",
-            width=112,
-            parameters=5_000_000,
             preprocessing=AREA_PREPROCESSING_NAME,
-            aggregator="vlad",
             clusters=128,
             shipped_vocabulary="efficientnet-lite0-128.npy",
         ),
@@ -193,27 +200,8 @@ EXTRACTOR_CONFIGS = {
             preprocessing="resize32x64",
             aggregator="none",
         ),
-        ExtractorConfig(
-            name="test-tiny-avg",
-            backbone="test-tiny",
-            implementation="synthetic:TinyBackbone",
-            width=16,
-            parameters=1_000,
-            preprocessing="square32",
-            aggregator="avg",
-            for_tests=True,
-        ),
-        ExtractorConfig(
-            name="test-tiny-vlad",
-            backbone="test-tiny",
-            implementation="synthetic:TinyBackbone",
-            width=16,
-            parameters=1_000,
-            preprocessing="square32",
-            aggregator="vlad",
-            clusters=8,
-            for_tests=True,
-        ),
+        _TINY,
+        replace(_TINY, name="test-tiny-vlad", aggregator="vlad", clusters=8),
         ExtractorConfig(
             name="test-slow-avg",
             backbone=SLOW_TEST_BACKBONE,
