@@ -258,7 +258,6 @@ ALL_MAPS = Depends(_require_all_maps)
 """Dependency of endpoints about no map or all maps: keys for some maps are refused."""
 GatewayDep = Annotated[GatewayContext, Depends(_get_gateway_context)]
 FileId = Annotated[UUID, _uuid_or_not_found("photo")]
-UploadId = Annotated[UUID, _uuid_or_not_found("upload")]
 JobId = Annotated[UUID, _uuid_or_not_found("job")]
 GenerationId = Annotated[UUID, _uuid_or_not_found("generation")]
 KeyId = Annotated[UUID, _uuid_or_not_found("key")]

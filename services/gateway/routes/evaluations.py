@@ -38,10 +38,8 @@ class EvaluationsResponse(ResponseModel):
     next_cursor: str | None
 
 
-@router.post(
-    "/evaluations", operation_id="evaluate", status_code=202, dependencies=[WRITE, ADMIT_JOB]
-)
-def start_evaluation(
+@router.post("/evaluations", status_code=202, dependencies=[WRITE, ADMIT_JOB])
+def evaluate(
     gateway: GatewayDep,
     idempotent: IdempotentDep,
     query: MapQuery,

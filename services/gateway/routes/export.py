@@ -62,7 +62,6 @@ class _ChunkRows:
 @router.get(
     "/generations/{generation_id}/descriptors",
     dependencies=[READ],
-    operation_id="export_descriptors",
     response_class=StreamingResponse,
     responses=describe_tar("A tar with `photos.csv`, `names.txt` and `descriptors.npy`."),
 )

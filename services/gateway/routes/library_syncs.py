@@ -28,9 +28,7 @@ class LibrarySyncRequest(RequestModel):
     )
 
 
-@router.post(
-    "/library-syncs", operation_id="sync_library", status_code=202, dependencies=[WRITE, ADMIT_JOB]
-)
+@router.post("/library-syncs", status_code=202, dependencies=[WRITE, ADMIT_JOB])
 def sync_library(
     gateway: GatewayDep, idempotent: IdempotentDep, query: MapQuery, options: LibrarySyncRequest
 ) -> JobAcceptedResponse:

@@ -83,10 +83,8 @@ class StartGenerationRequest(RequestModel):
     )
 
 
-@router.post(
-    "/vocabularies", operation_id="fit_vocabulary", status_code=202, dependencies=[WRITE, ADMIT_JOB]
-)
-def start_vocabulary_fit(
+@router.post("/vocabularies", status_code=202, dependencies=[WRITE, ADMIT_JOB])
+def fit_vocabulary(
     gateway: GatewayDep,
     idempotent: IdempotentDep,
     query: MapQuery,
@@ -110,7 +108,6 @@ def start_vocabulary_fit(
 
 @router.post(
     "/vocabularies/import",
-    operation_id="import_vocabulary",
     status_code=202,
     openapi_extra=multipart_schema(
         "a `.npz` file of `placewise vocabulary fit DIR`, or a `.npy` file of "
@@ -118,7 +115,7 @@ def start_vocabulary_fit(
     ),
     dependencies=[WRITE, ADMIT_JOB],
 )
-async def start_vocabulary_import(
+async def import_vocabulary(
     request: Request,
     gateway: GatewayDep,
     idempotent: IdempotentFormDep,
@@ -160,7 +157,6 @@ def read_vocabularies(gateway: GatewayDep, query: MapQuery) -> list[VocabularyRe
 
 @router.get(
     "/vocabularies/{vocabulary_id}/file",
-    operation_id="get_vocabulary_file",
     response_class=Response,
     responses={
         200: {
@@ -172,7 +168,7 @@ def read_vocabularies(gateway: GatewayDep, query: MapQuery) -> list[VocabularyRe
     },
     dependencies=[READ],
 )
-def read_vocabulary_file(gateway: GatewayDep, vocabulary_id: UUID, query: MapQuery) -> Response:
+def get_vocabulary_file(gateway: GatewayDep, vocabulary_id: UUID, query: MapQuery) -> Response:
     """Download a vocabulary as a file for `POST /vocabularies/import`.
 
     It is a `.npz` with its provenance, or a `.npy` (`application/octet-stream`) if the provenance
@@ -200,12 +196,7 @@ def read_generations(gateway: GatewayDep, query: MapQuery) -> list[GenerationRes
         ]
 
 
-@router.post(
-    "/generations",
-    operation_id="start_generation",
-    status_code=202,
-    dependencies=[WRITE, ADMIT_JOB],
-)
+@router.post("/generations", status_code=202, dependencies=[WRITE, ADMIT_JOB])
 def start_generation(
     gateway: GatewayDep, idempotent: IdempotentDep, body: StartGenerationRequest, query: MapQuery
 ) -> JobAcceptedResponse:

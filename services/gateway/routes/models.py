@@ -110,7 +110,6 @@ class ModelsResponse(ResponseModel):
 
 @router.post(
     "/models",
-    operation_id="add_model",
     status_code=202,
     openapi_extra=multipart_schema(
         "a checkpoint (`.ckpt`) of `placewise train`, a TorchScript or an `.onnx` file",
@@ -119,7 +118,7 @@ class ModelsResponse(ResponseModel):
     ),
     dependencies=[ADMIN, ADMIT_JOB],
 )
-async def upload_model(
+async def add_model(
     request: Request,
     gateway: GatewayDep,
     idempotent: IdempotentFormDep,
@@ -166,18 +165,16 @@ def _queue_model(
     return accepted
 
 
-@router.get("/models", operation_id="list_models", dependencies=[READ, NO_PARAMETERS, ALL_MAPS])
-def read_models(gateway: GatewayDep) -> ModelsResponse:
+@router.get("/models", dependencies=[READ, NO_PARAMETERS, ALL_MAPS])
+def list_models(gateway: GatewayDep) -> ModelsResponse:
     """List the added models by name."""
     with gateway.catalog.read() as session:
         models = [_model_response(session, model) for model in list_registered_models(session)]
     return ModelsResponse(models=models)
 
 
-@router.get(
-    "/models/{name}", operation_id="get_model", dependencies=[READ, NO_PARAMETERS, ALL_MAPS]
-)
-def read_model(gateway: GatewayDep, name: ModelNamePath) -> ModelResponse:
+@router.get("/models/{name}", dependencies=[READ, NO_PARAMETERS, ALL_MAPS])
+def get_model(gateway: GatewayDep, name: ModelNamePath) -> ModelResponse:
     """Get one model."""
     with gateway.catalog.read() as session:
         return _model_response(session, get_registered_model(session, name))

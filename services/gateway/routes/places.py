@@ -138,8 +138,8 @@ class UndoPlacesBody(RequestModel):
     )
 
 
-@router.post(PROPOSALS_PATH, operation_id="propose_places", dependencies=[READ])
-def propose_page(
+@router.post(PROPOSALS_PATH, dependencies=[READ])
+def propose_places(
     gateway: GatewayDep, query: Annotated[ProposalsParams, Query()], options: ProposalOptions
 ) -> PlaceProposalsResponse:
     """Propose places for the photos of a map that have neither coordinates nor a label.
@@ -164,8 +164,8 @@ def propose_page(
     )
 
 
-@router.post("/places", operation_id="give_places", dependencies=[WRITE])
-def give(gateway: GatewayDep, query: MapQuery, body: GivenPlacesBody) -> GivenPlacesResponse:
+@router.post("/places", dependencies=[WRITE])
+def give_places(gateway: GatewayDep, query: MapQuery, body: GivenPlacesBody) -> GivenPlacesResponse:
     """Give places to photos that have none, such as accepted proposals.
 
     A photo that has coordinates or a label is skipped. What a photo had before is kept: `POST
@@ -176,8 +176,8 @@ def give(gateway: GatewayDep, query: MapQuery, body: GivenPlacesBody) -> GivenPl
     )
 
 
-@router.post("/places/undo", operation_id="undo_places", dependencies=[WRITE])
-def undo(gateway: GatewayDep, query: MapQuery, body: UndoPlacesBody) -> UndonePlacesResponse:
+@router.post("/places/undo", dependencies=[WRITE])
+def undo_places(gateway: GatewayDep, query: MapQuery, body: UndoPlacesBody) -> UndonePlacesResponse:
     """Take back given places: photos have the values that they had before.
 
     A photo whose place was changed since is left as it is, and named.

@@ -187,7 +187,7 @@ def read_header(
     return PhotoHeaderResponse.model_validate(header)
 
 
-@router.post(POSITIONS_PATH, operation_id="propose_positions", dependencies=[READ])
+@router.post(POSITIONS_PATH, dependencies=[READ])
 def propose_positions(
     gateway: GatewayDep, query: MapQuery, body: PositionsBody
 ) -> ProposalsResponse:

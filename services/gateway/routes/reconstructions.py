@@ -81,13 +81,8 @@ class CoordinateProposalsResponse(ResponseModel):
     proposals: list[CoordinateProposalResponse] = Field(description="largest distance first")
 
 
-@router.post(
-    "/reconstructions",
-    operation_id="reconstruct",
-    status_code=202,
-    dependencies=[WRITE, ADMIT_JOB],
-)
-def start_reconstruction(
+@router.post("/reconstructions", status_code=202, dependencies=[WRITE, ADMIT_JOB])
+def reconstruct(
     gateway: GatewayDep,
     idempotent: IdempotentDep,
     query: MapQuery,
@@ -106,13 +101,8 @@ def start_reconstruction(
     )
 
 
-@router.post(
-    IMPORT_PATH,
-    operation_id="import_reconstruction",
-    status_code=202,
-    dependencies=[WRITE, ADMIT_JOB],
-)
-def start_import(
+@router.post(IMPORT_PATH, status_code=202, dependencies=[WRITE, ADMIT_JOB])
+def import_reconstruction(
     gateway: GatewayDep, idempotent: IdempotentDep, query: MapQuery, model: ColmapModel
 ) -> JobAcceptedResponse:
     """Use the cameras and poses of an existing COLMAP model, such as hloc's, for the map's photos.
@@ -178,12 +168,8 @@ def read_reconstruction(gateway: GatewayDep, query: MapQuery) -> ReconstructionR
         )
 
 
-@router.get(
-    "/reconstructions/{reconstruction_id}/proposals",
-    operation_id="list_coordinate_proposals",
-    dependencies=[READ],
-)
-def read_proposals(
+@router.get("/reconstructions/{reconstruction_id}/proposals", dependencies=[READ])
+def list_coordinate_proposals(
     gateway: GatewayDep, reconstruction_id: ReconstructionId, query: MapQuery
 ) -> CoordinateProposalsResponse:
     """List the photos whose coordinates disagree with the reconstruction, with proposed ones.
@@ -240,7 +226,6 @@ def _get_finished(session: Session, map_name: str, reconstruction_id: UUID) -> R
 
 @router.get(
     "/reconstructions/{reconstruction_id}/colmap",
-    operation_id="export_colmap",
     dependencies=[READ],
     response_class=StreamingResponse,
     responses=describe_tar(

@@ -36,8 +36,8 @@ def read_searches(gateway: GatewayDep, query: PageQuery) -> SearchHistoryRespons
     )
 
 
-@router.get("/database/stats", operation_id="database_stats", dependencies=[READ])
-def read_stats(gateway: GatewayDep, query: MapQuery) -> StatsResponse:
+@router.get("/database/stats", dependencies=[READ])
+def database_stats(gateway: GatewayDep, query: MapQuery) -> StatsResponse:
     """Get statistics of a map. Search times cover the last seven days.
 
     For maps with more than 10,000 photos, jobs or searches, the statistics are cached; `counted_at`

@@ -103,9 +103,7 @@ FRAME_PENDING: dict[int | str, dict[str, Any]] = {
 }
 
 
-@router.post(
-    "/tracks", operation_id="begin_track", status_code=201, dependencies=[READ, CHECK_DISK]
-)
+@router.post("/tracks", status_code=201, dependencies=[READ, CHECK_DISK])
 def begin_track(
     request: Request,
     gateway: GatewayDep,
@@ -192,7 +190,7 @@ def _read_track(gateway: GatewayContext, track_id: UUID, query: TrackReadParams)
     return Response(body.model_dump_json(), media_type="application/json")
 
 
-@router.delete("/tracks/{track_id}", operation_id="delete_track", dependencies=[WRITE])
+@router.delete("/tracks/{track_id}", dependencies=[WRITE])
 def delete_track(gateway: GatewayDep, track_id: TrackId, query: MapQuery) -> DeletedTrackResponse:
     """Delete a track with its frames."""
     with gateway.catalog.write() as session:
@@ -205,7 +203,6 @@ def delete_track(gateway: GatewayDep, track_id: TrackId, query: MapQuery) -> Del
 
 @router.post(
     "/tracks/{track_id}/frames",
-    operation_id="add_track_frame",
     response_model=TrackFrameResponse,
     responses=FRAME_PENDING,
     openapi_extra=multipart_schema("the frame's photo", ["captured_at"], **FRAME_FIELDS),
@@ -242,12 +239,11 @@ async def add_track_frame(
 
 @router.get(
     "/tracks/{track_id}/frames/{frame_id}",
-    operation_id="get_track_frame",
     response_model=TrackFrameResponse,
     responses=FRAME_PENDING,
     dependencies=[READ],
 )
-async def read_track_frame(
+async def get_track_frame(
     request: Request,
     response: Response,
     gateway: GatewayDep,
