@@ -10,12 +10,7 @@ import typer
 from placewise.answers import Job
 from placewise.client import Client
 from services.cli.client import MapOptions
-from services.cli.output import (
-    Table,
-    print_json,
-    print_note,
-    print_table,
-)
+from services.cli.output import Table, print_note, print_result
 from shared.errors import Conflict
 
 
@@ -35,15 +30,12 @@ def jobs(
         found = list(islice(client.jobs(**filters), limit))
         if retry:
             found = [_retry(client, job) for job in found]
-    if common.as_json:
-        print_json(found)
-        return
     table = Table("state", "file", "job", "created", "reason")
     for job in found:
         created = job.created_at.strftime("%Y-%m-%d %H:%M")
         reason = job.failure if job.error else job.waiting_for or ""
         table.add_row(job.state, job.filename or "", job.kind, created, reason)
-    print_table(table)
+    print_result(found, common.as_json, table)
 
 
 def _retry(client: Client, job: Job) -> Job:

@@ -11,15 +11,7 @@ import typer
 from placewise.answers import Map
 from services.cli.client import ServerOptions, active_generation, wait_for_job
 from services.cli.option_groups import CommandGroup
-from services.cli.output import (
-    Table,
-    format_pca,
-    format_percent,
-    print_json,
-    print_result,
-    print_table,
-    progress_bar,
-)
+from services.cli.output import Table, format_pca, format_percent, print_result, progress_bar
 from shared.errors import Conflict, InvalidRequest
 from shared.extractor_config.configs import MAX_PCA_DIMENSION, MIN_PHOTOS_TO_FIT
 
@@ -42,9 +34,6 @@ def list_maps(common: ServerOptions) -> None:
     """List all maps with their photo counts and extractors; `--json` has all their settings."""
     with common.connect() as client:
         maps = client.maps()
-    if common.as_json:
-        print_json(maps)
-        return
     counts = ("photos", "searchable", "queries")
     table = Table("map", *counts, "extractor", "vocabulary", "dimension")
     for map_ in maps:
@@ -59,7 +48,7 @@ def list_maps(common: ServerOptions) -> None:
             map_.vocabulary or "",
             _format_dimension(map_),
         )
-    print_table(table)
+    print_result(maps, common.as_json, table)
 
 
 def _format_dimension(map_: Map) -> str:

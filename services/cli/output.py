@@ -136,14 +136,6 @@ def print_note(message: str) -> None:
     err_console.print(message, soft_wrap=True, markup=False)
 
 
-def print_result(result: Any, as_json: bool, message: str) -> None:
-    """Print the result of a command as JSON, or a message about it."""
-    if as_json:
-        print_json(result)
-    else:
-        print_message(message)
-
-
 class Table(rich.table.Table):
     """A table for `print_table`. In a narrow terminal, long texts and names continue below.
 
@@ -192,6 +184,16 @@ def print_table(table: Table) -> None:
         typer.echo("\t".join(row))
     if table.caption:
         typer.echo(_plain_text(table.caption))
+
+
+def print_result(result: Any, as_json: bool, shown: str | Table) -> None:
+    """Print the result of a command as JSON, or else a message about it or a table of it."""
+    if as_json:
+        print_json(result)
+    elif isinstance(shown, str):
+        print_message(shown)
+    else:
+        print_table(shown)
 
 
 def _plain_text(cell: RenderableType) -> str:

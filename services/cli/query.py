@@ -12,13 +12,7 @@ from rich.table import Column
 
 from placewise.answers import CameraPose, Estimate, Matches
 from services.cli.client import MapOptions
-from services.cli.output import (
-    Table,
-    format_percent,
-    print_json,
-    print_message,
-    print_table,
-)
+from services.cli.output import Table, format_percent, print_json, print_message, print_table
 from shared.search_api.protocol import MAX_MATCHED_PHOTOS
 
 BAR_WIDTH = 20  # characters

@@ -25,7 +25,6 @@ from services.cli.output import (
     print_json,
     print_message,
     print_result,
-    print_table,
     progress_bar,
 )
 from shared.errors import Misconfigured
@@ -101,9 +100,6 @@ def list_added(common: ServerOptions) -> None:
     """List added models and the maps that use them."""
     with common.connect() as client:
         models = client.models()
-    if common.as_json:
-        print_json(models)
-        return
     name = Column("extractor", overflow="fold", min_width=12)
     table = Table(name, "network", "image", "dimension", "size", "licence", "maps", "note")
     for model in models:
@@ -117,7 +113,7 @@ def list_added(common: ServerOptions) -> None:
             escape(", ".join(model.maps)),
             escape(model.note or ""),
         )
-    print_table(table)
+    print_result(models, common.as_json, table)
 
 
 @app.command("remove")
@@ -138,9 +134,6 @@ def list_(as_json: JsonOption = False) -> None:
     """List extractors and their weights on this machine."""
     settings = read_settings()
     all_weights = [inspect_weights(config, settings) for config in list_extractor_configs(settings)]
-    if as_json:
-        print_json([asdict(weights) for weights in all_weights])
-        return
     name = Column("extractor", overflow="fold", min_width=23)
     table = Table(name, "available", "size", "source", "licence")
     for weights in all_weights:
@@ -151,7 +144,7 @@ def list_(as_json: JsonOption = False) -> None:
             escape(weights.source),
             escape(weights.licence),
         )
-    print_table(table)
+    print_result([asdict(weights) for weights in all_weights], as_json, table)
 
 
 @app.command("fetch")

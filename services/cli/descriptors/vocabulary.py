@@ -18,9 +18,7 @@ from services.cli.output import (
     Json,
     Table,
     atomic_write,
-    print_json,
     print_result,
-    print_table,
     printable_path,
     progress_bar,
 )
@@ -117,9 +115,6 @@ def list_(common: MapOptions) -> None:
         vocabularies = client.vocabularies()
         active = active_generation(client)
     active_id = active and active.vocabulary_id
-    if common.as_json:
-        print_json([{**v.as_json(), "active": v.vocabulary_id == active_id} for v in vocabularies])
-        return
     # IDs are folded, not truncated, so that they can be copied.
     name = Column("vocabulary", overflow="fold", min_width=36)
     table = Table("active", name, "origin", "clusters", "dimension", "photos", "created")
@@ -135,7 +130,8 @@ def list_(common: MapOptions) -> None:
             str(v.provenance.get("photos", "")),
             f"{v.created_at:%Y-%m-%d %H:%M:%S}",
         )
-    print_table(table)
+    listed = [{**v.as_json(), "active": v.vocabulary_id == active_id} for v in vocabularies]
+    print_result(listed, common.as_json, table)
 
 
 def _format_provenance(provenance: Json) -> str:

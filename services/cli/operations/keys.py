@@ -11,12 +11,7 @@ import typer
 from placewise.answers import Key
 from services.cli.client import ServerOptions
 from services.cli.option_groups import CommandGroup
-from services.cli.output import (
-    Table,
-    print_json,
-    print_result,
-    print_table,
-)
+from services.cli.output import Table, print_json, print_result
 from shared.errors import Conflict, NotFound
 from shared.security.api_keys import Scope
 
@@ -70,9 +65,6 @@ def list_(common: ServerOptions) -> None:
     """List all keys, including revoked and expired ones, without their secrets."""
     with common.connect() as client:
         listed = client.keys()
-    if common.as_json:
-        print_json(listed)
-        return
     table = Table("key", "name", "scopes", "maps", "created", "last used", "state")
     for item in listed:
         table.add_row(
@@ -84,7 +76,7 @@ def list_(common: ServerOptions) -> None:
             f"{item.last_used_at:%Y-%m-%dT%H:%M}" if item.last_used_at else "never",
             _key_status(item),
         )
-    print_table(table)
+    print_result(listed, common.as_json, table)
 
 
 @app.command("revoke")
