@@ -31,7 +31,6 @@ from shared.catalog.jobs import (
     UNFINISHED_STATES,
     Job,
     JobKind,
-    Priority,
     WaitingFor,
 )
 from shared.catalog.maps import Matching, increment_map_version, lock_map
@@ -61,13 +60,7 @@ def start_model_change(
             f"Wait for it, or cancel it: POST /api/v1/jobs/{running.id}/cancel.",
             job_id=str(running.id),
         )
-    job = Job(
-        id=new_id(),
-        map_id=map_id,
-        kind=kind,
-        priority=Priority.MODEL_CHANGE,
-        params=params,
-    )
+    job = Job(map_id=map_id, kind=kind, params=params)
     session.add(job)
     if kind == JobKind.FIT:
         map_.fitted_photos = count_live_photos(session, map_id, PhotoRole.DATABASE)

@@ -16,8 +16,7 @@ from shared.catalog.maps import get_map
 from shared.catalog.photos import PhotoRole
 from shared.errors import Conflict
 from shared.http.request_model import RequestModel
-from shared.ids import new_id
-from shared.jobs import Job, JobKind, Priority
+from shared.jobs import Job, JobKind
 from shared.responses import ResponseModel
 from shared.responses.maps import EvaluationResponse
 
@@ -60,13 +59,8 @@ def evaluate(
                 "The map has no described photo with coordinates or a place. Upload photos with "
                 "coordinates or places, and wait for their jobs.",
             )
-        job = Job(
-            id=new_id(),
-            map_id=map_.id,
-            kind=JobKind.EVALUATE,
-            priority=Priority.EVALUATION,
-            params={**params, "automatic": False},
-        )
+        params["automatic"] = False
+        job = Job(map_id=map_.id, kind=JobKind.EVALUATE, params=params)
         return idempotent.accept_job(session, job)
 
 

@@ -46,8 +46,7 @@ from shared.extractor_config.names import (
     MODEL_NAME_PATTERN,
     MODEL_NAME_RULE,
 )
-from shared.ids import new_id
-from shared.jobs import Job, JobKind, Priority
+from shared.jobs import Job, JobKind
 from shared.jobs.wakeups import JobMessage
 from shared.responses import ResponseModel
 from shared.responses.maps import ModelResponse, RemovedModelResponse
@@ -149,10 +148,8 @@ def _queue_model(
     upload = file.complete()
     with idempotent.begin_form(upload), gateway.catalog.write() as session:
         job = Job(
-            id=new_id(),
             map_id=get_map(session, map_name).id,
             kind=JobKind.ADD_MODEL,
-            priority=Priority.MODEL_CHANGE,
             params={
                 "object_key": upload.key,
                 "filename": upload.filename,

@@ -56,7 +56,7 @@ from shared.ingest.photo_metadata import (
     parse_tags,
     parse_time,
 )
-from shared.jobs import Job, JobKind, JobState, Priority
+from shared.jobs import Job, JobKind, JobState
 from shared.jobs.transitions import cancel_jobs, requeue_job_as_new
 from shared.jobs.wakeups import JobMessage
 from shared.responses.jobs import DeletedPhotoResponse
@@ -328,7 +328,6 @@ def _queue_again(session: Session, photo: Photo) -> Job:
         job = Job(
             map_id=photo.map_id,
             kind=JobKind.INDEX,
-            priority=Priority.UPLOAD,
             photo_id=photo.id,
             result={"file_id": str(photo.id)},  # described before: webhooks get no second event
         )

@@ -32,8 +32,7 @@ from shared.errors import Conflict, NotFound
 from shared.geodesy import distance_m
 from shared.geometry.colmap_model import ColmapModel, rename_images
 from shared.http.request_model import RequestModel
-from shared.ids import new_id
-from shared.jobs import Job, JobKind, Priority
+from shared.jobs import Job, JobKind
 from shared.jobs.wakeups import JobMessage
 from shared.responses import ResponseModel
 from shared.responses.reconstructions import (
@@ -123,13 +122,7 @@ def _queue(
         map_id = lock_map(session, get_map(session, map_name).id).id
         _check_not_running(session, map_id)
         check_reconstructable(session, map_id)
-        job = Job(
-            id=new_id(),
-            map_id=map_id,
-            kind=JobKind.RECONSTRUCT,
-            priority=Priority.MODEL_CHANGE,
-            params=params,
-        )
+        job = Job(map_id=map_id, kind=JobKind.RECONSTRUCT, params=params)
         accepted = idempotent.accept_job(session, job)
     gateway.wakeups.send(JobMessage.of(job, map_name))
     return accepted

@@ -27,7 +27,7 @@ from shared.catalog.jobs import UNFINISHED_STATES, WaitingFor
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
 from shared.ids import new_id
-from shared.jobs import Job, JobKind, JobState, Priority
+from shared.jobs import Job, JobKind, JobState
 from shared.jobs.transitions import CANCELLED_PER_TRANSACTION, cancel_jobs, succeed_job
 
 # What a model change waits for that the steward advances.
@@ -99,7 +99,6 @@ def _reindex_job(generation: Generation, photo_id: UUID) -> dict[str, object]:
         "id": new_id(),
         "map_id": generation.map_id,
         "kind": JobKind.REINDEX,
-        "priority": Priority.REINDEX,
         "photo_id": photo_id,
         "generation_id": generation.id,
     }
