@@ -22,6 +22,7 @@ from shared.catalog.database.base import (
     count_rows,
     db_now,
     db_now_plus,
+    insert_row,
     list_newest,
 )
 from shared.catalog.maps import MAP_NAME_PATTERN
@@ -100,9 +101,7 @@ def create_api_key(
         requests_per_minute=limits.requests_per_minute,
         max_photos=limits.max_photos,
     )
-    session.add(row)
-    session.flush()
-    session.refresh(row)
+    session.refresh(insert_row(session, row))
     return row, key
 
 

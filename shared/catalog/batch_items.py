@@ -24,7 +24,7 @@ from uuid import UUID
 import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.database.base import Base, JsonValue, count_rows, partial_index
+from shared.catalog.database.base import Base, JsonValue, count_rows, insert_row, partial_index
 from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState, Priority
 
 ITEMS_PER_STATEMENT = 1000  # rows inserted, or jobs selected, by one statement
@@ -78,9 +78,7 @@ def create_batch(
         params={"source": source, "listed": False, **(params or {})},
         progress_total=0,
     )
-    session.add(job)
-    session.flush()
-    return job
+    return insert_row(session, job)
 
 
 def add_batch_items(session: Session, job: Job, items: Iterable[dict[str, Any]]) -> None:

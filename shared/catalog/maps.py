@@ -36,6 +36,7 @@ from shared.catalog.database.base import (
     db_now_plus,
     for_update,
     get_or_insert,
+    insert_row,
     list_newest,
 )
 from shared.catalog.generations import (
@@ -112,7 +113,6 @@ def create_map(
     With None, its labels decide whether they are paths.
     """
     map_ = Map(
-        id=new_id(),
         name=name,
         extractor=extractor,
         place_labels_are_paths=bool(place_labels_are_paths),
@@ -124,11 +124,9 @@ def create_map(
     )
     try:
         with session.begin_nested():
-            session.add(map_)
-            session.flush()
+            return insert_row(session, map_)
     except IntegrityError:
         raise Conflict("map_exists", f"A map named {name!r} already exists.", map=name) from None
-    return map_
 
 
 def list_maps(session: Session) -> list[Map]:

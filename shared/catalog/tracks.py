@@ -27,6 +27,7 @@ from shared.catalog.database.base import (
     count_rows,
     db_now,
     get_in_map,
+    insert_row,
     list_newest,
     partial_index,
 )
@@ -251,9 +252,7 @@ def add_frame(
     track.version += 1
     track.updated_at = db_now()
     frame.version = track.version
-    session.add(frame)
-    session.flush()
-    return frame
+    return insert_row(session, frame)
 
 
 def latest_states(session: Session, track_ids: list[UUID]) -> dict[UUID, TrackFrame]:

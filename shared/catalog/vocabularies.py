@@ -90,32 +90,6 @@ def next_fit_photos(session: Session, map_: Map) -> int | None:
     return max(MIN_PHOTOS_TO_FIT, 2 * (map_.fitted_photos or 0))
 
 
-def add_vocabulary(
-    session: Session,
-    map_id: UUID,
-    origin: VocabularyOrigin,
-    *,
-    shape: tuple[int, int],
-    object_key: str,
-    sha256: str,
-    provenance: dict[str, Any],
-) -> Vocabulary:
-    """Register the centres stored under `object_key`; `shape` is (clusters, dimension)."""
-    vocabulary = Vocabulary(
-        id=new_id(),
-        map_id=map_id,
-        origin=origin,
-        clusters=shape[0],
-        dimension=shape[1],
-        object_key=object_key,
-        sha256=sha256,
-        provenance=provenance,
-    )
-    session.add(vocabulary)
-    session.flush()
-    return vocabulary
-
-
 def get_vocabulary(session: Session, map_id: UUID, vocabulary_id: UUID) -> Vocabulary:
     """Return a vocabulary of the map; NotFound (`vocabulary_not_found`)."""
     return get_in_map(session, Vocabulary, map_id, vocabulary_id)
@@ -178,11 +152,3 @@ def get_pca_source_generation(session: Session, map_id: UUID) -> Generation:
             dimension=active.dimension,
         )
     return active
-
-
-def add_whitening(session: Session, map_id: UUID, **columns: Any) -> StoredWhitening:
-    """Register a whitening that is stored under `object_key`."""
-    whitening = StoredWhitening(id=new_id(), map_id=map_id, **columns)
-    session.add(whitening)
-    session.flush()
-    return whitening

@@ -24,6 +24,7 @@ from shared.catalog.database.base import (
     JsonValue,
     UtcDateTime,
     db_now,
+    insert_row,
     list_newest,
     partial_index,
 )
@@ -101,9 +102,7 @@ def create_webhook(session: Session, url: str, events: list[EventKind]) -> Webho
     """
     secret = SECRET_PREFIX + base64.b64encode(secrets.token_bytes(SECRET_BYTES)).decode()
     webhook = Webhook(url=url, events=sorted(set(events)), secret=secret)
-    session.add(webhook)
-    session.flush()
-    session.refresh(webhook)
+    session.refresh(insert_row(session, webhook))
     return webhook
 
 

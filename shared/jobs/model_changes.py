@@ -19,7 +19,7 @@ from uuid import UUID
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from shared.catalog.database.base import db_now
+from shared.catalog.database.base import db_now, insert_row
 from shared.catalog.generations import (
     Generation,
     GenerationState,
@@ -36,7 +36,6 @@ from shared.catalog.jobs import (
 from shared.catalog.maps import Matching, increment_map_version, lock_map
 from shared.catalog.photos import PhotoRole, count_live_photos
 from shared.errors import Conflict
-from shared.ids import new_id
 from shared.jobs.transitions import cancel_job, cancel_jobs, requeue_job
 
 
@@ -98,7 +97,6 @@ def create_generation(session: Session, job: Job, **columns: Any) -> Generation:
     first = active is None
     is_decided = active and active.uses_matches is False and map_.matching == Matching.AUTO
     generation = Generation(
-        id=new_id(),
         map_id=job.map_id,
         state=GenerationState.ACTIVE if first else GenerationState.BUILDING,
         activated_at=db_now() if first else None,
@@ -107,8 +105,7 @@ def create_generation(session: Session, job: Job, **columns: Any) -> Generation:
         uses_matches=False if is_decided else None,
         **columns,
     )
-    session.add(generation)
-    session.flush()
+    insert_row(session, generation)
     if first:
         map_.extractor = generation.extractor
         increment_map_version(session, job.map_id)

@@ -31,6 +31,7 @@ from services.gateway.dependencies import (
 from services.gateway.photo_search import MAX_COUNTED_MATCHES, MetadataSearchParams, search_photos
 from services.gateway.responses import JobAcceptedResponse, MetadataSearchResponse, photo_response
 from shared.catalog.chunks import find_descriptor
+from shared.catalog.database.base import insert_row
 from shared.catalog.generations import active_generation
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import get_map, increment_map_version, lock_map
@@ -331,8 +332,7 @@ def _queue_again(session: Session, photo: Photo) -> Job:
             photo_id=photo.id,
             result={"file_id": str(photo.id)},  # described before: webhooks get no second event
         )
-        session.add(job)
-        session.flush()
+        insert_row(session, job)
         get_photo(session, photo.map_id, photo.id).job_id = job.id
     else:
         requeue_job_as_new(job, keep_result=True)

@@ -47,6 +47,7 @@ from services.gateway.tracks.schemas import (
 )
 from services.gateway.uploads.multipart import FormFile, multipart_schema, parse_form
 from services.gateway.uploads.query_photo import describe_query_job, receive_query_photo
+from shared.catalog.database.base import insert_row
 from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import QUERY_TTL_SECONDS
 from shared.catalog.maps import get_map
@@ -65,7 +66,6 @@ from shared.catalog.tracks import (
     select_frames,
 )
 from shared.errors import Conflict
-from shared.ids import new_id
 from shared.imaging.photo_header import read_photo_header
 from shared.jobs.wakeups import JobMessage
 from shared.responses import ResponseModel
@@ -114,14 +114,11 @@ def begin_track(
     """Begin a track in the map. Then add frames in the order of their times."""
     with reserve_photo_quota(request, gateway.settings), gateway.catalog.write() as session:
         track = Track(
-            id=new_id(),
             map_id=get_map(session, query.map).id,
             params=body.model_dump(mode="json", exclude_none=True),
             key_id=get_caller(request).key_id,
         )
-        session.add(track)
-        session.flush()
-        session.refresh(track)
+        session.refresh(insert_row(session, track))
         response = TrackResponse(**_track_fields(gateway, track, None))
         idempotent.store_response(session, 201, response)
     return response
@@ -282,7 +279,6 @@ def _accept_frame(
         with reserve_photo_quota(request, gateway.settings), gateway.catalog.write() as session:
             track = get_track(session, get_map(session, map_name).id, track_id, lock=True)
             frame = TrackFrame(
-                id=new_id(),
                 track_id=track.id,
                 captured_at=form.captured_at,
                 job_id=job_id,

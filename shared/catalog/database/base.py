@@ -270,6 +270,13 @@ def get_in_map(
     return row
 
 
+def insert_row(session: Session, row: Row) -> Row:
+    """Insert a row at once, and return it with its id."""
+    session.add(row)
+    session.flush()
+    return row
+
+
 def get_or_insert(session: Session, statement: sa.Select[Row], row: Row) -> Row:
     """Return the row that `statement` selects; if there is none, insert and return `row`."""
     existing = session.scalar(statement)
@@ -277,11 +284,9 @@ def get_or_insert(session: Session, statement: sa.Select[Row], row: Row) -> Row:
         return existing
     try:
         with session.begin_nested():
-            session.add(row)
-            session.flush()
+            return insert_row(session, row)
     except IntegrityError:  # another process inserted it between the two statements
         return session.scalars(statement).one()
-    return row
 
 
 def count_rows(session: Session, statement: sa.Select[Any], limit: int | None = None) -> int:
