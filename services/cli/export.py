@@ -54,6 +54,13 @@ app = CommandGroup(
     help="Export a map's descriptors, its reconstruction, pairs for hloc, or photos as GeoJSON."
 )
 
+FolderOption = Annotated[
+    Path,
+    typer.Option(
+        metavar="DIR", file_okay=False, help="Output folder; created if it does not exist."
+    ),
+]
+
 
 class PairNames(StrEnum):
     FILENAME = "filename"
@@ -64,12 +71,7 @@ class PairNames(StrEnum):
 @app.command("descriptors")
 def descriptors(
     common: MapOptions,
-    out: Annotated[
-        Path,
-        typer.Option(
-            metavar="DIR", file_okay=False, help="Output folder; created if it does not exist."
-        ),
-    ],
+    out: FolderOption,
     generation: Annotated[
         UUID | None,
         typer.Option(metavar="ID", help="Generation to export. Default: the active one."),
@@ -130,12 +132,7 @@ def _active_generation_id(client: Client) -> UUID:
 @app.command("colmap")
 def colmap(
     common: MapOptions,
-    out: Annotated[
-        Path,
-        typer.Option(
-            metavar="DIR", file_okay=False, help="Output folder; created if it does not exist."
-        ),
-    ],
+    out: FolderOption,
 ) -> None:
     """Export the map's reconstruction as a COLMAP model of each component: DIR/0, DIR/1, ...
 

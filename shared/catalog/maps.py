@@ -166,11 +166,11 @@ def mark_map_deleted(session: Session, map_: Map) -> None:
 
 
 def get_or_create_default_map(
-    session: Session, extractor: str, row_type: RowType = RowType.FLOAT32
+    session: Session, extractor: str, row_type: str = RowType.FLOAT32
 ) -> Map:
     """Return the map named `default`, created on first use."""
     named_default = sa.select(Map).where(Map.name == DEFAULT_MAP)
-    new = Map(name=DEFAULT_MAP, extractor=extractor, row_type=row_type)
+    new = Map(name=DEFAULT_MAP, extractor=extractor, row_type=RowType(row_type))
     return get_or_insert(session, named_default, new)
 
 

@@ -219,9 +219,7 @@ def delete_map(gateway: GatewayDep, name: MapNamePath) -> DeletedMapResponse:
         mark_map_deleted(session, map_)
         if name == DEFAULT_MAP:
             settings = gateway.settings
-            get_or_create_default_map(
-                session, settings.new_map_extractor, RowType(settings.descriptor_rows)
-            )
+            get_or_create_default_map(session, settings.new_map_extractor, settings.descriptor_rows)
 
     gateway.catalog.run(remove)
     return DeletedMapResponse(success=True, message=f"The map {name} is deleted.", deleted_map=name)
