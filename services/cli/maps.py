@@ -155,9 +155,7 @@ def switch(
     name: MapName,
     extractor: Annotated[
         str | None,
-        typer.Option(
-            "--extractor", help="Extractor name, for example gsv:NAME for an added model."
-        ),
+        typer.Option(help="Extractor name, for example gsv:NAME for an added model."),
     ] = None,
     vocabulary: Annotated[
         UUID | None,

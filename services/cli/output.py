@@ -90,7 +90,6 @@ MapOption = Annotated[
 TimeZoneOption = Annotated[
     str | None,
     typer.Option(
-        "--time-zone",
         metavar="ZONE",
         help="Time zone of photos whose EXIF has none, such as +02:00 or Europe/Paris.",
     ),

@@ -50,7 +50,6 @@ def add(
     name: Annotated[
         str,
         typer.Option(
-            "--name",
             metavar="NAME",
             help="Permanent name; maps refer to it as gsv:NAME, torchscript:NAME or onnx:NAME.",
         ),
@@ -58,15 +57,12 @@ def add(
     options: Annotated[
         str | None,
         typer.Option(
-            "--options",
             help="TorchScript or ONNX file: what its network expects, and the aggregator, as in "
             "input.size=288x288,aggregator=vlad.",
         ),
     ] = None,
-    licence: Annotated[
-        str | None, typer.Option("--licence", help="Licence of the weights.")
-    ] = None,
-    note: Annotated[str | None, typer.Option("--note", help="Free-text note.")] = None,
+    licence: Annotated[str | None, typer.Option(help="Licence of the weights.")] = None,
+    note: Annotated[str | None, typer.Option(help="Free-text note.")] = None,
 ) -> None:
     """Upload a checkpoint, TorchScript or ONNX file as an extractor for maps.
 

@@ -87,7 +87,7 @@ def export(
         UUID, typer.Argument(metavar="ID", help="Vocabulary ID; see `vocabulary list`.")
     ],
     out: Annotated[
-        Path, typer.Option("--out", metavar="FILE.npz", help="Output file, accepted by `import`.")
+        Path, typer.Option(metavar="FILE.npz", help="Output file, accepted by `import`.")
     ],
 ) -> None:
     """Write a vocabulary of the map to a file: .npz, or .npy if its provenance is unknown."""

@@ -24,7 +24,7 @@ def create(
     name: Annotated[
         str, typer.Argument(metavar="NAME", help="Name of the key: its owner or purpose.")
     ],
-    scope: Annotated[list[Scope], typer.Option("--scope", help="Scope to grant. Can be repeated.")],
+    scope: Annotated[list[Scope], typer.Option(help="Scope to grant. Can be repeated.")],
     maps: Annotated[
         list[str] | None,
         typer.Option("--map", help="Only map that the key may use. Can be repeated. Default: all."),

@@ -220,9 +220,7 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
 def restore_trash(
     prefix: Annotated[
         str,
-        typer.Option(
-            "--prefix", help="Only objects whose key starts with this prefix, such as originals/."
-        ),
+        typer.Option(help="Only objects whose key starts with this prefix, such as originals/."),
     ] = "",
     as_json: JsonOption = False,
 ) -> None:

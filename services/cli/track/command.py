@@ -51,7 +51,7 @@ def track(
         typer.Argument(metavar="SOURCE", exists=True, help="A folder of photos, or a video."),
     ],
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE.gpx", help="Write the track as GPX.")
+        Path | None, typer.Option(metavar="FILE.gpx", help="Write the track as GPX.")
     ] = None,
     motion: Annotated[
         str | None,
