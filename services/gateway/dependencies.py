@@ -21,10 +21,12 @@ from fastapi import Depends, Query, Request
 from prometheus_client import CollectorRegistry, Counter
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.authentication import Authenticator, get_caller
 from services.http_connections import ConnectionLimits, Connections
+from shared.catalog.database.base import Condition, list_newest
 from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import UNFINISHED_STATES, get_job
 from shared.catalog.maps import DEFAULT_MAP, get_map
@@ -217,6 +219,13 @@ class PageParams(BaseModel):
             return UUID(self.cursor) if self.cursor else None
         except ValueError:
             raise invalid_cursor_error() from None
+
+    def read(
+        self, session: Session, table: type[Row], *conditions: Condition
+    ) -> tuple[list[Row], str | None]:
+        """Read a page of the newest rows that match, and the cursor of the next one, if any."""
+        rows = list_newest(session, table, *conditions, limit=self.limit + 1, before=self.before)
+        return self.split(rows)
 
     def split(
         self, rows: list[Row], cursor_of: Callable[[Any], object] = lambda row: row.id

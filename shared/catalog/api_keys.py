@@ -23,7 +23,6 @@ from shared.catalog.database.base import (
     db_now,
     db_now_plus,
     insert_row,
-    list_newest,
 )
 from shared.catalog.maps import MAP_NAME_PATTERN
 from shared.catalog.photos import Photo
@@ -128,11 +127,6 @@ def authenticate_api_key(session: Session, sha256: str) -> ApiKey:
             "create another one: placewise keys create.",
         )
     return key
-
-
-def list_api_keys(session: Session) -> list[ApiKey]:
-    """List all keys, also revoked and expired ones, newest first."""
-    return list_newest(session, ApiKey)
 
 
 def revoke_api_key(session: Session, key_id: UUID) -> ApiKey:

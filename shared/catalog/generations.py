@@ -20,7 +20,6 @@ from shared.catalog.database.base import (
     UtcDateTime,
     db_now,
     for_update,
-    get_in_map,
     list_newest,
     partial_index,
 )
@@ -96,21 +95,11 @@ def active_generation(session: Session, map_id: UUID) -> Generation | None:
     )
 
 
-def get_generation(session: Session, map_id: UUID, generation_id: UUID) -> Generation:
-    """Return a generation of the map; NotFound (`generation_not_found`)."""
-    return get_in_map(session, Generation, map_id, generation_id)
-
-
 def lock_generation(session: Session, generation_id: UUID) -> Generation:
     """Lock the generation's row until the end of the transaction, and return it refreshed."""
     return session.scalars(
         for_update(select(Generation).where(Generation.id == generation_id))
     ).one()
-
-
-def list_generations(session: Session, map_id: UUID) -> list[Generation]:
-    """List the map's generations, newest first."""
-    return list_newest(session, Generation, Generation.map_id == map_id)
 
 
 class Evaluation(Journaled, Base):
@@ -131,14 +120,6 @@ class Evaluation(Journaled, Base):
         Index("ix_evaluations_map_id", "map_id", "id"),
         Index("ix_evaluations_generation", "generation_id", "id"),
     )
-
-
-def list_evaluations(
-    session: Session, map_id: UUID, limit: int, before: UUID | None = None
-) -> list[Evaluation]:
-    """List the map's evaluations, newest first, up to `limit`; `before` is the page's cursor."""
-    is_of_map = Evaluation.map_id == map_id
-    return list_newest(session, Evaluation, is_of_map, limit=limit, before=before)
 
 
 def latest_evaluation(session: Session, generation_id: UUID) -> Evaluation | None:

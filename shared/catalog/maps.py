@@ -37,7 +37,6 @@ from shared.catalog.database.base import (
     for_update,
     get_or_insert,
     insert_row,
-    list_newest,
 )
 from shared.catalog.generations import (
     Generation,
@@ -262,13 +261,6 @@ class Search(Base):
         sa.Index("ix_searches_map_id", "map_id", "id"),
         sa.Index("ix_searches_time", "searched_at"),
     )
-
-
-def list_searches(
-    session: Session, map_id: UUID, limit: int, before: UUID | None = None
-) -> list[Search]:
-    """List the map's searches, newest first, up to `limit`; `before` is the page's cursor."""
-    return list_newest(session, Search, Search.map_id == map_id, limit=limit, before=before)
 
 
 RECENT_SEARCHES = 100

@@ -28,7 +28,6 @@ from shared.catalog.database.base import (
     db_now,
     get_in_map,
     insert_row,
-    list_newest,
     partial_index,
 )
 from shared.errors import Conflict, NotFound
@@ -116,11 +115,6 @@ def is_pending() -> Condition:
 def get_track(session: Session, map_id: UUID, track_id: UUID, *, lock: bool = False) -> Track:
     """Return a track of the map; NotFound (`track_not_found`)."""
     return get_in_map(session, Track, map_id, track_id, lock=lock)
-
-
-def list_tracks(session: Session, map_id: UUID, limit: int, before: UUID | None) -> list[Track]:
-    """List the map's tracks, newest first; `before` is the page's cursor."""
-    return list_newest(session, Track, Track.map_id == map_id, limit=limit, before=before)
 
 
 def get_frame(session: Session, track_id: UUID, frame_id: UUID) -> TrackFrame:

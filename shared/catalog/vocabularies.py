@@ -16,7 +16,6 @@ from shared.catalog.database.base import (
     UtcDateTime,
     db_now,
     get_in_map,
-    list_newest,
 )
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import Map
@@ -93,11 +92,6 @@ def next_fit_photos(session: Session, map_: Map) -> int | None:
 def get_vocabulary(session: Session, map_id: UUID, vocabulary_id: UUID) -> Vocabulary:
     """Return a vocabulary of the map; NotFound (`vocabulary_not_found`)."""
     return get_in_map(session, Vocabulary, map_id, vocabulary_id)
-
-
-def list_vocabularies(session: Session, map_id: UUID) -> list[Vocabulary]:
-    """List the map's vocabularies, newest first."""
-    return list_newest(session, Vocabulary, Vocabulary.map_id == map_id)
 
 
 class StoredWhitening(Journaled, Base):

@@ -25,7 +25,6 @@ from shared.catalog.database.base import (
     UtcDateTime,
     db_now,
     insert_row,
-    list_newest,
     partial_index,
 )
 from shared.errors import NotFound
@@ -114,25 +113,12 @@ def get_webhook(session: Session, webhook_id: UUID) -> Webhook:
     return webhook
 
 
-def list_webhooks(session: Session) -> list[Webhook]:
-    """List all webhooks, newest first."""
-    return list_newest(session, Webhook, Webhook.deleted_at.is_(None))
-
-
 def delete_webhook(session: Session, webhook_id: UUID) -> Webhook:
     """Delete a webhook with all its deliveries, also pending ones; NotFound."""
     webhook = get_webhook(session, webhook_id)
     session.execute(delete(Delivery).where(Delivery.webhook_id == webhook_id))
     webhook.secret, webhook.deleted_at = "", db_now()
     return webhook
-
-
-def list_deliveries(
-    session: Session, webhook_id: UUID, limit: int, before: UUID | None
-) -> list[Delivery]:
-    """List the webhook's deliveries, newest first, up to `limit`; `before` is the page's cursor."""
-    is_of_webhook = Delivery.webhook_id == webhook_id
-    return list_newest(session, Delivery, is_of_webhook, limit=limit, before=before)
 
 
 def subscribed_webhook_ids(session: Session, event: EventKind) -> list[UUID]:

@@ -11,7 +11,7 @@ from services.gateway.dependencies import GatewayDep, MapQuery, PageQuery
 from services.gateway.idempotency import IdempotentDep
 from services.gateway.responses import JobAcceptedResponse
 from shared.catalog.chunks import has_geotagged
-from shared.catalog.generations import active_generation, list_evaluations
+from shared.catalog.generations import Evaluation, active_generation
 from shared.catalog.maps import get_map
 from shared.catalog.photos import PhotoRole
 from shared.errors import Conflict
@@ -64,14 +64,12 @@ def evaluate(
         return idempotent.accept_job(session, job)
 
 
-@router.get("/evaluations", operation_id="list_evaluations", dependencies=[READ])
-def read_evaluations(gateway: GatewayDep, query: PageQuery) -> EvaluationsResponse:
+@router.get("/evaluations", dependencies=[READ])
+def list_evaluations(gateway: GatewayDep, query: PageQuery) -> EvaluationsResponse:
     """List evaluations, newest first, including automatic ones."""
-    before = query.before
     with gateway.catalog.read() as session:
-        map_id = get_map(session, query.map).id
-        rows = list_evaluations(session, map_id, query.limit + 1, before)
-    page, next_cursor = query.split(rows)
+        is_of_map = Evaluation.map_id == get_map(session, query.map).id
+        page, next_cursor = query.read(session, Evaluation, is_of_map)
     return EvaluationsResponse(
         evaluations=[EvaluationResponse.model_validate(row) for row in page],
         next_cursor=next_cursor,

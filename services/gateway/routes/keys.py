@@ -9,7 +9,8 @@ from pydantic import Field
 
 from services.gateway.authentication import ADMIN
 from services.gateway.dependencies import NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep, KeyId
-from shared.catalog.api_keys import KeyLimits, create_api_key, list_api_keys, revoke_api_key
+from shared.catalog.api_keys import ApiKey, KeyLimits, create_api_key, revoke_api_key
+from shared.catalog.database.base import list_newest
 from shared.catalog.maps import MAP_NAME_PATTERN
 from shared.http.request_model import RequestModel
 from shared.responses.maps import CreatedKeyResponse, KeyResponse
@@ -51,7 +52,7 @@ class CreateKeyRequest(RequestModel):
 def list_keys(gateway: GatewayDep) -> list[KeyResponse]:
     """List all keys, newest first, including revoked ones. The secrets are not stored."""
     with gateway.catalog.read() as session:
-        return [KeyResponse.model_validate(key) for key in list_api_keys(session)]
+        return [KeyResponse.model_validate(key) for key in list_newest(session, ApiKey)]
 
 
 @router.post("/keys", status_code=201, dependencies=[ADMIN])

@@ -17,11 +17,12 @@ from services.gateway.idempotency import IdempotentDep, IdempotentFormDep, Idemp
 from services.gateway.responses import JobAcceptedResponse
 from services.gateway.uploads.multipart import FormFile, multipart_schema, receive_form_file
 from shared.catalog.chunks import estimate_described
-from shared.catalog.generations import list_generations
+from shared.catalog.database.base import list_newest
+from shared.catalog.generations import Generation
 from shared.catalog.maps import get_map
 from shared.catalog.models import check_model_registered
 from shared.catalog.photos import PhotoRole, has_live_photo
-from shared.catalog.vocabularies import get_pca_source_generation, get_vocabulary, list_vocabularies
+from shared.catalog.vocabularies import Vocabulary, get_pca_source_generation, get_vocabulary
 from shared.config.settings import Settings
 from shared.errors import Conflict, Misconfigured, invalid_field_error
 from shared.extractor_config.configs import (
@@ -147,11 +148,12 @@ def _queue_import(
     return accepted
 
 
-@router.get("/vocabularies", operation_id="list_vocabularies", dependencies=[READ])
-def read_vocabularies(gateway: GatewayDep, query: MapQuery) -> list[VocabularyResponse]:
+@router.get("/vocabularies", dependencies=[READ])
+def list_vocabularies(gateway: GatewayDep, query: MapQuery) -> list[VocabularyResponse]:
     """List the vocabularies of a map, newest first, with their provenance."""
     with gateway.catalog.read() as session:
-        vocabularies = list_vocabularies(session, get_map(session, query.map).id)
+        is_of_map = Vocabulary.map_id == get_map(session, query.map).id
+        vocabularies = list_newest(session, Vocabulary, is_of_map)
     return [VocabularyResponse.model_validate(vocabulary) for vocabulary in vocabularies]
 
 
@@ -186,13 +188,14 @@ def get_vocabulary_file(gateway: GatewayDep, vocabulary_id: UUID, query: MapQuer
     )
 
 
-@router.get("/generations", operation_id="list_generations", dependencies=[READ])
-def read_generations(gateway: GatewayDep, query: MapQuery) -> list[GenerationResponse]:
+@router.get("/generations", dependencies=[READ])
+def list_generations(gateway: GatewayDep, query: MapQuery) -> list[GenerationResponse]:
     """List the generations of a map, newest first."""
     with gateway.catalog.read() as session:
+        is_of_map = Generation.map_id == get_map(session, query.map).id
         return [
             GenerationResponse.of_row(generation, photos=estimate_described(session, generation.id))
-            for generation in list_generations(session, get_map(session, query.map).id)
+            for generation in list_newest(session, Generation, is_of_map)
         ]
 
 

@@ -37,7 +37,7 @@ from services.gateway.routes.positions import (
 from services.gateway.similarity.execute import find_similar, query_from_photo
 from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import count_searchable
-from shared.catalog.database.base import Condition, count_rows, for_update, list_newest
+from shared.catalog.database.base import Condition, count_rows, for_update
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map, increment_map_version, lock_map
 from shared.catalog.photos import Photo, has_given_place, is_geotagged
@@ -155,8 +155,7 @@ def propose_places(
             ~is_geotagged(),
         )
         total = count_rows(session, select(Photo.id).where(*without))
-        photos = list_newest(session, Photo, *without, limit=query.limit + 1, before=query.before)
-    page, next_cursor = query.split(photos)
+        page, next_cursor = query.read(session, Photo, *without)
     return PlaceProposalsResponse(
         total=total,
         proposals=_propose_places(gateway, query.map, page, options),

@@ -62,7 +62,6 @@ from shared.catalog.tracks import (
     get_frame,
     get_track,
     latest_states,
-    list_tracks,
     select_frames,
 )
 from shared.errors import Conflict
@@ -124,12 +123,12 @@ def begin_track(
     return response
 
 
-@router.get("/tracks", operation_id="list_tracks", dependencies=[READ])
-def read_tracks(gateway: GatewayDep, page: PageQuery) -> TracksResponse:
+@router.get("/tracks", dependencies=[READ])
+def list_tracks(gateway: GatewayDep, page: PageQuery) -> TracksResponse:
     """List the tracks of the map, newest first, each with the state of its last applied frame."""
     with gateway.catalog.read() as session:
-        map_id = get_map(session, page.map).id
-        tracks, next_cursor = page.split(list_tracks(session, map_id, page.limit + 1, page.before))
+        is_of_map = Track.map_id == get_map(session, page.map).id
+        tracks, next_cursor = page.read(session, Track, is_of_map)
         last = latest_states(session, [track.id for track in tracks])
     return TracksResponse(
         tracks=[
