@@ -30,7 +30,6 @@ from services.cli.ingest.upload import (
     NoFitOption,
     UpdateOption,
     manifest_has_keys,
-    switch_off_fits,
     upload_photos,
     wait_for_batch,
 )
@@ -183,7 +182,7 @@ def index(
         progress = stack.enter_context(progress_bar())
         print_note(f"Indexing into {common.describe_target(client)}")
         if no_fit:
-            switch_off_fits(client)
+            client.update_map(client.stats().map, auto_fit=False)
         if batch is not None:
             report = wait_for_batch(client, batch(client), progress)
         else:
