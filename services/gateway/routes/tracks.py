@@ -357,15 +357,11 @@ def _frame_response(
     status: Literal["pending", "applied", "failed"] = (
         "pending" if frame.pending else "failed" if frame.state is None else "applied"
     )
-    return TrackFrameResponse(
+    return TrackFrameResponse.of_row(
+        frame,
         frame_id=frame.id,
-        captured_at=frame.captured_at,
-        filename=frame.filename,
         status=status,
         state=smoothed or frame.state,
-        error=frame.error,
-        job_id=frame.job_id,
         job_url=job_url(frame.job_id, map_name),
         frame_url=url_in_map(f"/tracks/{frame.track_id}/frames/{frame.id}", map_name),
-        version=frame.version,
     )
