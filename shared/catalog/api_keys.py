@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from datetime import datetime
 from uuid import UUID
 
-from sqlalchemy import BigInteger, Integer, String, Text, Uuid, or_, select, update
+from sqlalchemy import BigInteger, Integer, String, Text, or_, select, update
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.database.base import (
-    Base,
+    Entity,
     Journaled,
     JsonValue,
     UtcDateTime,
@@ -28,16 +28,14 @@ from shared.catalog.maps import MAP_NAME_PATTERN
 from shared.catalog.photos import Photo
 from shared.catalog.tracks import Track, TrackFrame
 from shared.errors import NotFound, Unauthorized, invalid_field_error
-from shared.ids import new_id
 from shared.security.api_keys import Scope, api_key_prefix, generate_api_key, hash_api_key
 
 
-class ApiKey(Journaled, Base):
+class ApiKey(Journaled, Entity):
     """An API key. A limit that is null defaults to the one of the settings."""
 
     __tablename__ = "api_keys"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     name: Mapped[str] = mapped_column(Text)
     prefix: Mapped[str] = mapped_column(String(20))
     sha256: Mapped[str] = mapped_column(String(64), unique=True)

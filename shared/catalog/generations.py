@@ -14,7 +14,7 @@ from sqlalchemy import BigInteger, Boolean, ForeignKey, Index, Integer, String, 
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.database.base import (
-    Base,
+    Entity,
     Journaled,
     JsonValue,
     UtcDateTime,
@@ -25,10 +25,9 @@ from shared.catalog.database.base import (
 )
 from shared.enums import GenerationState as GenerationState
 from shared.enums import RowType as RowType
-from shared.ids import new_id
 
 
-class Generation(Journaled, Base):
+class Generation(Journaled, Entity):
     """A generation. `spec` has everything that determines a descriptor's value.
 
     `calibration` is a `shared.evaluation.places.PlaceModel`, fitted by evaluations.
@@ -36,7 +35,6 @@ class Generation(Journaled, Base):
 
     __tablename__ = "generations"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"), index=True)
     state: Mapped[GenerationState] = mapped_column(String(20))
     extractor: Mapped[str] = mapped_column(String(200))
@@ -102,12 +100,11 @@ def lock_generation(session: Session, generation_id: UUID) -> Generation:
     ).one()
 
 
-class Evaluation(Journaled, Base):
+class Evaluation(Journaled, Entity):
     """The metrics of an evaluation; `searchable` is the number of searchable photos back then."""
 
     __tablename__ = "evaluations"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"))
     generation_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("generations.id"))
     automatic: Mapped[bool] = mapped_column(Boolean, default=False)

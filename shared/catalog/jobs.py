@@ -34,8 +34,8 @@ from sqlalchemy import Boolean, ForeignKey, Index, Integer, Select, String, Uuid
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.database.base import (
-    Base,
     Condition,
+    Entity,
     JsonValue,
     UtcDateTime,
     db_now,
@@ -45,7 +45,6 @@ from shared.catalog.database.base import (
     partial_index,
 )
 from shared.enums import JobState as JobState
-from shared.ids import new_id
 from shared.telemetry.request_ids import (
     MAX_REQUEST_ID_CHARACTERS,
     current_request_id,
@@ -158,12 +157,11 @@ def _priority_of_kind(context: Any) -> Priority:
     return JOB_TYPES[context.get_current_parameters()["kind"]].priority
 
 
-class Job(Base):
+class Job(Entity):
     """A job. See the module's docstring for `state`, `attempts` and the lease."""
 
     __tablename__ = "jobs"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"))
     kind: Mapped[JobKind] = mapped_column(String(30))
     state: Mapped[JobState] = mapped_column(String(20), default=JobState.QUEUED)

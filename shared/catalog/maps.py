@@ -28,6 +28,7 @@ from shared.catalog.chunks import (
 )
 from shared.catalog.database.base import (
     Base,
+    Entity,
     Journaled,
     JsonValue,
     UtcDateTime,
@@ -54,7 +55,6 @@ from shared.catalog.photos import (
 )
 from shared.enums import Matching as Matching
 from shared.errors import Conflict, NotFound
-from shared.ids import new_id
 from shared.place_paths import look_like_paths
 
 DEFAULT_MAP = "default"
@@ -62,12 +62,11 @@ MAP_NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 DELETED_NAME_PREFIX = "deleted/"  # valid names of maps have no slash
 
 
-class Map(Journaled, Base):
+class Map(Journaled, Entity):
     """A map. Every transaction that changes its search results increments `version`."""
 
     __tablename__ = "maps"
 
-    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
     name: Mapped[str] = mapped_column(sa.String(100), unique=True)
     extractor: Mapped[str] = mapped_column(sa.String(200))
     version: Mapped[int] = mapped_column(sa.BigInteger, default=0)
@@ -234,12 +233,11 @@ def decide_label_paths(session: Session, map_: Map) -> bool:
     return 2 * sum(labels.values()) > located and look_like_paths(labels)
 
 
-class Search(Base):
+class Search(Entity):
     """A completed similarity search, for the history and the statistics."""
 
     __tablename__ = "searches"
 
-    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
     map_id: Mapped[UUID] = mapped_column(sa.Uuid, sa.ForeignKey("maps.id"))
     generation_id: Mapped[UUID] = mapped_column(sa.Uuid)
     query_photo_id: Mapped[UUID | None] = mapped_column(sa.Uuid)

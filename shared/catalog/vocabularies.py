@@ -10,7 +10,7 @@ from sqlalchemy import Float, ForeignKey, Integer, String, Text, Uuid
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.database.base import (
-    Base,
+    Entity,
     Journaled,
     JsonValue,
     UtcDateTime,
@@ -25,10 +25,9 @@ from shared.extractor_config.configs import (
     MIN_PHOTOS_TO_FIT,
     get_extractor_config,
 )
-from shared.ids import new_id
 
 
-class Vocabulary(Journaled, Base):
+class Vocabulary(Journaled, Entity):
     """A vocabulary: (clusters, dimension) float32 centres in a `.npy` file under `object_key`.
 
     `provenance` is that of `shared.descriptors.vocabulary_file`.
@@ -36,7 +35,6 @@ class Vocabulary(Journaled, Base):
 
     __tablename__ = "vocabularies"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"), index=True)
     origin: Mapped[VocabularyOrigin] = mapped_column(String(20))
     clusters: Mapped[int] = mapped_column(Integer)
@@ -94,7 +92,7 @@ def get_vocabulary(session: Session, map_id: UUID, vocabulary_id: UUID) -> Vocab
     return get_in_map(session, Vocabulary, map_id, vocabulary_id)
 
 
-class StoredWhitening(Journaled, Base):
+class StoredWhitening(Journaled, Entity):
     """A PCA whitening from `dimension` to `components`, stored under `object_key`.
 
     The file is one of `shared.descriptors.pca_whitening`. It is deleted after a grace period when
@@ -103,7 +101,6 @@ class StoredWhitening(Journaled, Base):
 
     __tablename__ = "whitenings"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"), index=True)
     dimension: Mapped[int] = mapped_column(Integer)
     components: Mapped[int] = mapped_column("kept", Integer)

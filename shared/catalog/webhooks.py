@@ -19,7 +19,7 @@ from sqlalchemy import Index, Integer, String, Text, Uuid, delete, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.database.base import (
-    Base,
+    Entity,
     Journaled,
     JsonValue,
     UtcDateTime,
@@ -47,7 +47,7 @@ class DeliveryState(StrEnum):
     FAILED = "failed"  # no more attempts
 
 
-class Webhook(Journaled, Base):
+class Webhook(Journaled, Entity):
     """A webhook. Its secret signs the events, so it is stored in plain text, also in the journal.
 
     A deleted one keeps its row, without the secret: the journal records its deletion.
@@ -55,7 +55,6 @@ class Webhook(Journaled, Base):
 
     __tablename__ = "webhooks"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     url: Mapped[str] = mapped_column(Text)
     events: Mapped[list[str]] = mapped_column(JsonValue)
     secret: Mapped[str] = mapped_column(Text)
@@ -63,7 +62,7 @@ class Webhook(Journaled, Base):
     deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
 
-class Delivery(Base):
+class Delivery(Entity):
     """One event for one webhook.
 
     It has no foreign key to the webhook, because the deletion of a webhook must not block the
@@ -72,7 +71,6 @@ class Delivery(Base):
 
     __tablename__ = "webhook_deliveries"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     webhook_id: Mapped[UUID] = mapped_column(Uuid)
     event_id: Mapped[UUID] = mapped_column(Uuid)  # the same for all attempts and webhooks
     event: Mapped[EventKind] = mapped_column(String(50))

@@ -24,6 +24,7 @@ from sqlalchemy.types import Boolean, Float, Text, TypeDecorator
 
 from shared.errors import NotFound
 from shared.geodesy import EARTH_RADIUS_M, flush_to_zero
+from shared.ids import new_id
 
 SQLITE_DISTANCE_FUNCTION = "placewise_distance_m"
 
@@ -76,6 +77,14 @@ class Base(DeclarativeBase):
             "pk": "pk_%(table_name)s",
         }
     )
+
+
+class Entity(Base):
+    """Base of the tables whose rows have an id: a UUIDv7, by which they are in order of age."""
+
+    __abstract__ = True
+
+    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id, sort_order=-1)
 
 
 def partial_index(name: str, *columns: Any, only: Condition, unique: bool = False) -> sa.Index:
