@@ -40,7 +40,6 @@ from services.steward.webhooks import WebhookDispatcher
 from shared.catalog.api_keys import create_api_key, has_admin_key
 from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import REQUEST_TIMEOUTS, Catalog
-from shared.catalog.generations import RowType
 from shared.catalog.installation import check_before_new_catalog, open_installation_store
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.processes import delete_processes, process_heartbeat
@@ -139,9 +138,7 @@ def run_standalone(settings: Settings, *, lazy_extractor: bool = False) -> Itera
         store = open_installation_store(catalog, settings, exclusive=True)
         wakeups = InProcessWakeups(extractor.look)
         with catalog.write() as session:
-            get_or_create_default_map(
-                session, settings.new_map_extractor, RowType(settings.descriptor_rows)
-            )
+            get_or_create_default_map(session, settings.new_map_extractor, settings.descriptor_rows)
         if settings.database_url is None:
             # The lock proves that no other worker is alive: rows are left from a killed process.
             with catalog.write() as session:

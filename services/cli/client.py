@@ -6,14 +6,18 @@ import contextlib
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Annotated
 
+import typer
 from rich.progress import Progress
 
 from placewise.answers import Generation, Job
 from placewise.client import Client, Work
 from services.cli import collection_paused
 from services.cli.environment import read_settings
-from services.cli.output import print_note
+from services.cli.output import JsonOption, MapOption, print_note
 from shared.config.command_line import command_line
 from shared.config.embedded_home import RunningServer, find_running_server
 from shared.errors import Misconfigured, Unavailable
@@ -22,7 +26,7 @@ START_TIMEOUT_SECONDS = 30.0
 
 
 @contextlib.contextmanager
-def connect(server: str | None, map_name: str | None, key: str | None = None) -> Iterator[Client]:
+def connect(server: str | None, map_name: str | None, key: str | None) -> Iterator[Client]:
     """Connect to a server, starting an embedded one if none runs.
 
     Args:
@@ -86,18 +90,53 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
             serving.join()
 
 
-def describe_target(client: Client, server: str | None, map_name: str | None) -> str:
-    """Name the map and the server that `connect` has selected for these options."""
-    folder = "" if server else f", which serves {read_settings().placewise_home}"
-    return f"map {map_name or 'default'} of {client.url}{folder}"
+@dataclass(frozen=True, slots=True)
+class ServerOptions:
+    """Options of the commands that call a server."""
+
+    server: Annotated[
+        str | None,
+        typer.Option(
+            envvar="PLACEWISE_SERVER",
+            help="URL of a Placewise server. Default: the server on PLACEWISE_HOME.",
+        ),
+    ] = None
+    key: Annotated[
+        str | None,
+        typer.Option(
+            envvar="PLACEWISE_KEY",
+            help="API key. Prefer the environment variable: other users of this machine can see "
+            "command-line options. Not required for the server on PLACEWISE_HOME.",
+        ),
+    ] = None
+    as_json: JsonOption = False
+
+    def connect(self, map_name: str | None = None) -> AbstractContextManager[Client]:
+        """Connect as the function `connect` does."""
+        return connect(self.server, map_name, self.key)
 
 
-def client_command(*arguments: str, server: str | None, map_name: str | None) -> str:
-    """Return a command line that works in any folder, for the server and the map of `connect`."""
-    options = ["--map", map_name] if map_name else []
-    if server:
-        return command_line(*arguments, *options, "--server", server)
-    return command_line(*arguments, *options, home=read_settings().placewise_home)
+@dataclass(frozen=True, slots=True)
+class MapOptions(ServerOptions):
+    """Options of the commands that use a map."""
+
+    map_name: MapOption = None
+
+    def connect(self, map_name: str | None = None) -> AbstractContextManager[Client]:
+        """Connect as the function `connect` does, to the map of the option unless one is named."""
+        return connect(self.server, map_name or self.map_name, self.key)
+
+    def describe_target(self, client: Client) -> str:
+        """Name the map and the server that `connect` has selected."""
+        folder = "" if self.server else f", which serves {read_settings().placewise_home}"
+        return f"map {self.map_name or 'default'} of {client.url}{folder}"
+
+    def command_line(self, *arguments: str) -> str:
+        """Return a command line that works in any folder, for the same server and map."""
+        options = ["--map", self.map_name] if self.map_name else []
+        if self.server:
+            return command_line(*arguments, *options, "--server", self.server)
+        return command_line(*arguments, *options, home=read_settings().placewise_home)
 
 
 POLL_SECONDS = 1.0  # short, so that the progress bar moves

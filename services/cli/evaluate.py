@@ -16,14 +16,10 @@ from rich.table import Column
 from placewise.answers import Evaluation
 from placewise.client import Client
 from placewise.protocol import drop_none
-from services.cli.client import connect, wait_for_job
+from services.cli.client import MapOptions, wait_for_job
 from services.cli.environment import lab_missing
 from services.cli.output import (
     Json,
-    JsonOption,
-    KeyOption,
-    MapOption,
-    ServerOption,
     Table,
     format_percent,
     print_json,
@@ -42,14 +38,11 @@ SeedOption = Annotated[int | None, typer.Option(min=0, help="Live map: random se
 
 
 def evaluate(
+    common: MapOptions,
     data: Annotated[Path | None, typer.Option(hidden=True)] = None,
     predictions: Annotated[Path | None, typer.Option(hidden=True)] = None,
     sample: SampleOption = None,
     seed: SeedOption = None,
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Measure retrieval recall in a live map.
 
@@ -58,25 +51,18 @@ def evaluate(
     for option, value in (("--data", data), ("--predictions", predictions)):
         if value is not None:
             raise lab_missing(f"`evaluate {option}`")
-    evaluate_map(sample, seed, map_name, server, key, as_json)
+    evaluate_map(common, sample, seed)
 
 
-def evaluate_map(
-    sample: int | None,
-    seed: int | None,
-    map_name: str | None,
-    server: str | None,
-    key: str | None,
-    as_json: bool,
-) -> None:
+def evaluate_map(common: MapOptions, sample: int | None, seed: int | None) -> None:
     """Evaluate a map with its own photos (leave-one-out) and its labelled queries."""
     parameters = drop_none(sample=sample, seed=seed)
-    with connect(server, map_name, key) as client, progress_bar() as progress:
+    with common.connect() as client, progress_bar() as progress:
         job = wait_for_job(client, client.evaluate(**parameters), progress, "evaluating")
         requested = (e for e in client.evaluations() if not e.automatic)
         shown = list(islice(requested, MAX_EVALUATIONS_SHOWN))
         vocabularies = _vocabulary_origins(client)
-    if as_json:
+    if common.as_json:
         print_json(job.result or {})
         return
     _print_evaluations(shown, vocabularies)

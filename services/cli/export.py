@@ -21,14 +21,11 @@ from rich.progress import Progress
 
 from placewise.answers import Photo
 from placewise.client import Client
-from services.cli.client import active_generation, connect
+from services.cli.client import MapOptions, active_generation
 from services.cli.ingest.photo_archive import unpack_tar
+from services.cli.option_groups import CommandGroup
 from services.cli.output import (
     Json,
-    JsonOption,
-    KeyOption,
-    MapOption,
-    ServerOption,
     atomic_write,
     check_output_path,
     print_result,
@@ -53,9 +50,16 @@ PHOTO_PROPERTIES = {
     "image_url",
 }
 
-app = typer.Typer(
+app = CommandGroup(
     help="Export a map's descriptors, its reconstruction, pairs for hloc, or photos as GeoJSON."
 )
+
+FolderOption = Annotated[
+    Path,
+    typer.Option(
+        metavar="DIR", file_okay=False, help="Output folder; created if it does not exist."
+    ),
+]
 
 
 class PairNames(StrEnum):
@@ -66,27 +70,19 @@ class PairNames(StrEnum):
 
 @app.command("descriptors")
 def descriptors(
-    out: Annotated[
-        Path,
-        typer.Option(
-            metavar="DIR", file_okay=False, help="Output folder; created if it does not exist."
-        ),
-    ],
+    common: MapOptions,
+    out: FolderOption,
     generation: Annotated[
         UUID | None,
         typer.Option(metavar="ID", help="Generation to export. Default: the active one."),
     ] = None,
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Export descriptors as NumPy and CSV files.
 
     Writes descriptors.npy (photos x dimension, float32), and photos.csv and names.txt in the order
     of its rows. Use np.load(..., mmap_mode="r") to read descriptors.npy without loading it.
     """
-    with connect(server, map_name, key) as client, progress_bar() as progress:
+    with common.connect() as client, progress_bar() as progress:
         generation = generation or _active_generation_id(client)
         receive = partial(client.export_descriptors, generation)
         with _received_tar(out, receive, progress) as tar:
@@ -99,7 +95,7 @@ def descriptors(
     path = printable_path(out / "descriptors.npy")
     print_result(
         {"file": path, "generation_id": str(generation), "rows": rows, "dimension": dimension},
-        as_json,
+        common.as_json,
         f"{path}: {rows} rows of {dimension} dimensions.",
     )
 
@@ -135,22 +131,14 @@ def _active_generation_id(client: Client) -> UUID:
 
 @app.command("colmap")
 def colmap(
-    out: Annotated[
-        Path,
-        typer.Option(
-            metavar="DIR", file_okay=False, help="Output folder; created if it does not exist."
-        ),
-    ],
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
+    common: MapOptions,
+    out: FolderOption,
 ) -> None:
     """Export the map's reconstruction as a COLMAP model of each component: DIR/0, DIR/1, ...
 
     Images have the path or file name of their photo, and the photo's ID where that is not unique.
     """
-    with connect(server, map_name, key) as client, progress_bar() as progress:
+    with common.connect() as client, progress_bar() as progress:
         made = client.reconstruction()
         receive = partial(client.export_colmap, made.reconstruction_id)
         with _received_tar(out, receive, progress) as tar:
@@ -159,13 +147,14 @@ def colmap(
     folder = printable_path(out)
     print_result(
         {"folder": folder, "components": len(made.components), "photos": photos},
-        as_json,
+        common.as_json,
         f"{folder}: {photos} photos in {len(made.components)} COLMAP models.",
     )
 
 
 @app.command("pairs")
 def pairs(
+    common: MapOptions,
     out: Annotated[Path, typer.Option(metavar="FILE.txt", help="Output file.")],
     top_k: Annotated[
         int, typer.Option(min=1, max=100, help="Maximum number of matches per query.")
@@ -173,10 +162,6 @@ def pairs(
     names: Annotated[
         PairNames, typer.Option(help="Identify photos by file name, path in their folder, or ID.")
     ] = PairNames.FILENAME,
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Export retrieval pairs in hloc's format: `QUERY MATCH` on each line, best match first.
 
@@ -185,7 +170,7 @@ def pairs(
     check_output_path(out, ".txt", "a list of pairs")
     count = skipped = 0
     with (
-        connect(server, map_name, key) as client,
+        common.connect() as client,
         progress_bar() as progress,
         atomic_write(out) as file,
     ):
@@ -210,7 +195,7 @@ def pairs(
                 file.write(f"{_photo_name(photo, names)} {_photo_name(match, names)}\n".encode())
     print_result(
         {"file": str(out), "queries": len(queries), "pairs": count, "skipped": skipped},
-        as_json,
+        common.as_json,
         f"{out}: {count} pairs for {len(queries)} queries, {skipped} of them without a descriptor.",
     )
 
@@ -239,11 +224,8 @@ def _check_unique_names(photos: list[Photo], names: PairNames) -> None:
 
 @app.command("geojson")
 def geojson(
+    common: MapOptions,
     out: Annotated[Path, typer.Option(metavar="FILE.geojson", help="Output file.")],
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Export every photo with its metadata as a GeoJSON feature (RFC 7946).
 
@@ -252,7 +234,7 @@ def geojson(
     check_output_path(out, ".geojson", "a GeoJSON export")
     photos = 0
     with (
-        connect(server, map_name, key) as client,
+        common.connect() as client,
         progress_bar() as progress,
         atomic_write(out) as file,
     ):
@@ -264,7 +246,7 @@ def geojson(
             file.write((b",\n" if photos else b"\n") + feature.encode())
             photos += 1
         file.write(b"\n]}\n")
-    print_result({"file": str(out), "photos": photos}, as_json, f"{out}: {photos} photos.")
+    print_result({"file": str(out), "photos": photos}, common.as_json, f"{out}: {photos} photos.")
 
 
 def _to_feature(photo: Photo) -> Json:

@@ -9,21 +9,13 @@ import typer
 
 from placewise.answers import Job
 from placewise.client import Client
-from services.cli.client import connect
-from services.cli.output import (
-    JsonOption,
-    KeyOption,
-    MapOption,
-    ServerOption,
-    Table,
-    print_json,
-    print_note,
-    print_table,
-)
+from services.cli.client import MapOptions
+from services.cli.output import Table, print_note, print_result
 from shared.errors import Conflict
 
 
 def jobs(
+    common: MapOptions,
     failed: Annotated[
         bool, typer.Option("--failed", help="Only failed jobs, with the reason.")
     ] = False,
@@ -31,26 +23,19 @@ def jobs(
         bool, typer.Option("--retry", help="Queue the failed jobs of the list again.")
     ] = False,
     limit: Annotated[int, typer.Option(min=1, help="Number of jobs, the newest first.")] = 50,
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """List the jobs of a map, newest first, with the file and the reason of a failure."""
     filters = {"state": ["failed"]} if failed or retry else {}
-    with connect(server, map_name, key) as client:
+    with common.connect() as client:
         found = list(islice(client.jobs(**filters), limit))
         if retry:
             found = [_retry(client, job) for job in found]
-    if as_json:
-        print_json(found)
-        return
     table = Table("state", "file", "job", "created", "reason")
     for job in found:
         created = job.created_at.strftime("%Y-%m-%d %H:%M")
         reason = job.failure if job.error else job.waiting_for or ""
         table.add_row(job.state, job.filename or "", job.kind, created, reason)
-    print_table(table)
+    print_result(found, common.as_json, table)
 
 
 def _retry(client: Client, job: Job) -> Job:

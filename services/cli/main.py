@@ -130,6 +130,8 @@ class _PlacewiseGroup(_ListingGroup):
 
 def build_app(names: Collection[str] | None = None, commands: Commands = COMMANDS) -> typer.Typer:
     """Build the application with the named commands, or all, importing only their modules."""
+    from services.cli.option_groups import with_single_options
+
     app = _new_app()
     for name in commands if names is None else names:
         panel, module, attribute = commands[name]
@@ -139,7 +141,7 @@ def build_app(names: Collection[str] | None = None, commands: Commands = COMMAND
             app.add_typer(command, name=name, cls=group, rich_help_panel=panel)
         else:
             app.command(name, rich_help_panel=panel, **getattr(command, "command_settings", {}))(
-                command
+                with_single_options(command)
             )
     return app
 

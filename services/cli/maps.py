@@ -9,23 +9,13 @@ from uuid import UUID
 import typer
 
 from placewise.answers import Map
-from services.cli.client import active_generation, connect, wait_for_job
-from services.cli.output import (
-    JsonOption,
-    KeyOption,
-    ServerOption,
-    Table,
-    format_pca,
-    format_percent,
-    print_json,
-    print_result,
-    print_table,
-    progress_bar,
-)
+from services.cli.client import ServerOptions, active_generation, wait_for_job
+from services.cli.option_groups import CommandGroup
+from services.cli.output import Table, format_pca, format_percent, print_result, progress_bar
 from shared.errors import Conflict, InvalidRequest
 from shared.extractor_config.configs import MAX_PCA_DIMENSION, MIN_PHOTOS_TO_FIT
 
-app = typer.Typer(
+app = CommandGroup(
     help="Manage maps: named photo databases, each with its own extractor and vocabulary."
 )
 
@@ -40,15 +30,10 @@ MapName = Annotated[str, typer.Argument(metavar="NAME")]
 
 
 @app.command("list")
-def list_maps(
-    server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False
-) -> None:
+def list_maps(common: ServerOptions) -> None:
     """List all maps with their photo counts and extractors; `--json` has all their settings."""
-    with connect(server, None, key) as client:
+    with common.connect() as client:
         maps = client.maps()
-    if as_json:
-        print_json(maps)
-        return
     counts = ("photos", "searchable", "queries")
     table = Table("map", *counts, "extractor", "vocabulary", "dimension")
     for map_ in maps:
@@ -63,7 +48,7 @@ def list_maps(
             map_.vocabulary or "",
             _format_dimension(map_),
         )
-    print_table(table)
+    print_result(maps, common.as_json, table)
 
 
 def _format_dimension(map_: Map) -> str:
@@ -83,6 +68,7 @@ def _format_features(map_: Map) -> str:
 
 @app.command("create")
 def create(
+    common: ServerOptions,
     name: MapName,
     extractor: Annotated[
         str | None,
@@ -109,12 +95,9 @@ def create(
     elsewhere: Annotated[
         float | None, typer.Option(help=f"{ELSEWHERE_HELP} Default: 0.33.")
     ] = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Create an empty map."""
-    with connect(server, None, key) as client:
+    with common.connect() as client:
         created = client.create_map(
             name,
             extractor,
@@ -123,11 +106,12 @@ def create(
             matching=matching,
             elsewhere=elsewhere,
         )
-    print_result(created, as_json, f"Created map {name} with extractor {created.extractor}.")
+    print_result(created, common.as_json, f"Created map {name} with extractor {created.extractor}.")
 
 
 @app.command("update")
 def update(
+    common: ServerOptions,
     name: MapName,
     auto_fit: Annotated[
         bool | None,
@@ -139,9 +123,6 @@ def update(
     ] = None,
     matching: Annotated[str | None, typer.Option(help=MATCHING_HELP)] = None,
     elsewhere: Annotated[float | None, typer.Option(help=ELSEWHERE_HELP)] = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Change automatic fits and matching of a map, and how many queries are from elsewhere.
 
@@ -149,7 +130,7 @@ def update(
     """
     if auto_fit is None and matching is None and elsewhere is None:
         raise InvalidRequest("no_option", "Specify --auto-fit, --matching or --elsewhere.")
-    with connect(server, name, key) as client, progress_bar() as progress:
+    with common.connect(name) as client, progress_bar() as progress:
         updated = client.update_map(name, auto_fit=auto_fit, matching=matching, elsewhere=elsewhere)
         if matching == "on" and updated.model_change_id:
             wait_for_job(client, updated.model_change_id, progress, "local features")
@@ -157,7 +138,7 @@ def update(
     changes = [_describe_auto_fit(updated)] if auto_fit is not None else []
     changes += [f"matching {_format_features(updated)}"] if matching else []
     changes += [f"{format_percent(updated.elsewhere)} from elsewhere"] if elsewhere else []
-    print_result(updated, as_json, f"Map {name}: {'; '.join(changes)}.")
+    print_result(updated, common.as_json, f"Map {name}: {'; '.join(changes)}.")
 
 
 def _describe_auto_fit(map_: Map) -> str:
@@ -170,12 +151,11 @@ def _describe_auto_fit(map_: Map) -> str:
 
 @app.command("switch")
 def switch(
+    common: ServerOptions,
     name: MapName,
     extractor: Annotated[
         str | None,
-        typer.Option(
-            "--extractor", help="Extractor name, for example gsv:NAME for an added model."
-        ),
+        typer.Option(help="Extractor name, for example gsv:NAME for an added model."),
     ] = None,
     vocabulary: Annotated[
         UUID | None,
@@ -193,9 +173,6 @@ def switch(
             "descriptors.",
         ),
     ] = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Reindex a map with another extractor or vocabulary, or with shorter descriptors.
 
@@ -203,7 +180,7 @@ def switch(
     """
     if extractor is None and vocabulary is None and pca is None:
         raise InvalidRequest("no_option", "Specify --extractor, --vocabulary or --pca.")
-    with connect(server, name, key) as client, progress_bar() as progress:
+    with common.connect(name) as client, progress_bar() as progress:
         if pca == 0 and extractor is None and vocabulary is None:
             active = active_generation(client)
             if active is None or active.pca_from is None:
@@ -219,7 +196,7 @@ def switch(
         size = format_pca(whitening)
     print_result(
         job,
-        as_json,
+        common.as_json,
         f"Map {name} now uses {extractor or 'other descriptors'}: {result['photos']} photos, "
         f"{size}, {result['failed']} failed.",
     )
@@ -227,14 +204,12 @@ def switch(
 
 @app.command("delete")
 def delete(
+    common: ServerOptions,
     name: MapName,
     yes: Annotated[bool, typer.Option("--yes", help="Delete without confirmation.")] = False,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Delete a map and all its photos."""
-    with connect(server, None, key) as client:
+    with common.connect() as client:
         photos = next((m.photos for m in client.maps() if m.name == name), None)
         if photos and not yes and not sys.stdin.isatty():
             raise Conflict(
@@ -244,4 +219,4 @@ def delete(
         if photos and not yes:
             typer.confirm(f"Delete map {name} and its {photos} photos?", abort=True)
         deleted = client.delete_map(name)
-    print_result(deleted, as_json, deleted.message)
+    print_result(deleted, common.as_json, deleted.message)

@@ -90,27 +90,8 @@ MapOption = Annotated[
 TimeZoneOption = Annotated[
     str | None,
     typer.Option(
-        "--time-zone",
         metavar="ZONE",
         help="Time zone of photos whose EXIF has none, such as +02:00 or Europe/Paris.",
-    ),
-]
-ServerOption = Annotated[
-    str | None,
-    typer.Option(
-        "--server",
-        envvar="PLACEWISE_SERVER",
-        help="URL of a Placewise server. Default: the server on PLACEWISE_HOME.",
-    ),
-]
-
-KeyOption = Annotated[
-    str | None,
-    typer.Option(
-        "--key",
-        envvar="PLACEWISE_KEY",
-        help="API key. Prefer the environment variable: other users of this machine can see "
-        "command-line options. Not required for the server on PLACEWISE_HOME.",
     ),
 ]
 
@@ -152,14 +133,6 @@ def print_message(message: str) -> None:
 def print_note(message: str) -> None:
     """As `print_message`, to stderr: about the command, not a part of its answer."""
     err_console.print(message, soft_wrap=True, markup=False)
-
-
-def print_result(result: Any, as_json: bool, message: str) -> None:
-    """Print the result of a command as JSON, or a message about it."""
-    if as_json:
-        print_json(result)
-    else:
-        print_message(message)
 
 
 class Table(rich.table.Table):
@@ -210,6 +183,16 @@ def print_table(table: Table) -> None:
         typer.echo("\t".join(row))
     if table.caption:
         typer.echo(_plain_text(table.caption))
+
+
+def print_result(result: Any, as_json: bool, shown: str | Table) -> None:
+    """Print the result of a command as JSON, or else a message about it or a table of it."""
+    if as_json:
+        print_json(result)
+    elif isinstance(shown, str):
+        print_message(shown)
+    else:
+        print_table(shown)
 
 
 def _plain_text(cell: RenderableType) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -11,18 +12,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Column
 
 from placewise.answers import CameraPose, Estimate, Matches
-from services.cli.client import connect, describe_target
-from services.cli.output import (
-    JsonOption,
-    KeyOption,
-    MapOption,
-    ServerOption,
-    Table,
-    format_percent,
-    print_json,
-    print_message,
-    print_table,
-)
+from services.cli.client import MapOptions
+from services.cli.output import Table, format_percent, print_json, print_message, print_table
 from shared.search_api.protocol import MAX_MATCHED_PHOTOS
 
 BAR_WIDTH = 20  # characters
@@ -33,28 +24,30 @@ CALIBRATION_SOURCES = {
 }
 
 
-def query(
-    photo: Annotated[Path, typer.Argument(metavar="PHOTO", exists=True, dir_okay=False)],
-    top_k: Annotated[int, typer.Option(min=1, max=100, help="Maximum number of results.")] = 10,
+@dataclass(frozen=True, slots=True)
+class SearchOptions:
+    """Options of the search, by the names of their parameters in `Client.similar`."""
+
+    top_k: Annotated[int, typer.Option(min=1, max=100, help="Maximum number of results.")] = 10
     min_score: Annotated[
         float | None, typer.Option(min=-1, max=1, help="Minimum cosine similarity.")
-    ] = None,
-    near: Annotated[str | None, typer.Option(help="Only photos within LAT,LON,RADIUS_M.")] = None,
-    box: Annotated[str | None, typer.Option(help="Only photos within S,W,N,E (degrees).")] = None,
+    ] = None
+    near: Annotated[str | None, typer.Option(help="Only photos within LAT,LON,RADIUS_M.")] = None
+    box: Annotated[str | None, typer.Option(help="Only photos within S,W,N,E (degrees).")] = None
     captured_after: Annotated[
         str | None, typer.Option(help="Only photos taken after this ISO 8601 time.")
-    ] = None,
+    ] = None
     captured_before: Annotated[
         str | None, typer.Option(help="Only photos taken before this ISO 8601 time.")
-    ] = None,
-    place: Annotated[str | None, typer.Option(help="Only photos with this place label.")] = None,
+    ] = None
+    place: Annotated[str | None, typer.Option(help="Only photos with this place label.")] = None
     tags: Annotated[
         str | None, typer.Option(help="Only photos that have all of these comma-separated tags.")
-    ] = None,
+    ] = None
     tags_like: Annotated[
         str | None,
         typer.Option(help="Only photos whose tags contain all of these comma-separated parts."),
-    ] = None,
+    ] = None
     matches: Annotated[
         int | None,
         typer.Option(
@@ -63,7 +56,7 @@ def query(
             help="Match the local features of the first N results. Default: as the map decides.",
             metavar="N",
         ),
-    ] = None,
+    ] = None
     rerank: Annotated[
         int | None,
         typer.Option(
@@ -72,11 +65,11 @@ def query(
             help="Match the first N results, and order them by their matching points.",
             metavar="N",
         ),
-    ] = None,
+    ] = None
     pose: Annotated[
         bool,
         typer.Option("--pose", help="Compute where the camera stood and looked, and how exactly."),
-    ] = False,
+    ] = False
     focal_length: Annotated[
         float | None,
         typer.Option(
@@ -85,7 +78,7 @@ def query(
             help="With --pose: focal length of the camera as a multiple of the photo's longer "
             "side. Default: that of the EXIF, or else it is estimated.",
         ),
-    ] = None,
+    ] = None
     certainty: Annotated[
         float | None,
         typer.Option(
@@ -93,49 +86,33 @@ def query(
             help="Share of the answers that must be right, above 0: the estimate answers at the "
             "finest level that is certain enough. Default: the server's CERTAINTY.",
         ),
-    ] = None,
+    ] = None
     elsewhere: Annotated[
         float | None,
         typer.Option(
             help="Share of your queries that are from elsewhere than the map, between 0 and 1. "
             "Default: the map's.",
         ),
-    ] = None,
+    ] = None
     guarantee: Annotated[
         float | None,
         typer.Option(
             help="Share of all queries that may get a wrong answer, instead of --certainty. Takes "
             "labelled queries."
         ),
-    ] = None,
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
+    ] = None
+
+
+def query(
+    options: SearchOptions,
+    common: MapOptions,
+    photo: Annotated[Path, typer.Argument(metavar="PHOTO", exists=True, dir_okay=False)],
 ) -> None:
     """Find the indexed photos most similar to PHOTO. The query photo is not stored."""
-    with connect(server, map_name, key) as client:
-        answer = client.similar(
-            photo,
-            top_k=top_k,
-            min_score=min_score,
-            matches=matches,
-            rerank=rerank,
-            pose=pose,
-            focal_length=focal_length,
-            near=near,
-            box=box,
-            captured_after=captured_after,
-            captured_before=captured_before,
-            place=place,
-            tags=tags,
-            tags_like=tags_like,
-            certainty=certainty,
-            elsewhere=elsewhere,
-            guarantee=guarantee,
-        )
-        target = describe_target(client, server, map_name)
-    if as_json:
+    with common.connect() as client:
+        answer = client.similar(photo, **asdict(options))
+        target = common.describe_target(client)
+    if common.as_json:
         print_json(answer)
         return
     levels = answer.estimate.levels

@@ -13,13 +13,9 @@ from rich.table import Column
 
 from placewise.answers import Component, Reconstruction
 from placewise.client import Client
-from services.cli.client import connect, wait_for_job
+from services.cli.client import MapOptions, wait_for_job
 from services.cli.output import (
     Json,
-    JsonOption,
-    KeyOption,
-    MapOption,
-    ServerOption,
     Table,
     first_names,
     format_percent,
@@ -36,6 +32,7 @@ MAX_NAMES_SHOWN = 5
 
 
 def reconstruct(
+    common: MapOptions,
     model: Annotated[
         Path | None,
         typer.Option(
@@ -62,10 +59,6 @@ def reconstruct(
             help="Reconstruct all photos again, instead of adding new ones to the present model.",
         ),
     ] = False,
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Reconstruct the map's photos, so that queries have a pose.
 
@@ -83,10 +76,10 @@ def reconstruct(
         poses = poses.model_copy(update={"origin": place})
     if model and (model / "images.bin").exists() and (model / "images.txt").exists():
         print_note(f"{model} has text files, too. As COLMAP does, the binary files are read.")
-    with connect(server, map_name, key) as client, progress_bar() as progress:
+    with common.connect() as client, progress_bar() as progress:
         job = wait_for_job(client, _start(client, poses, from_scratch), progress, "reconstructing")
         made = client.reconstruction()
-    if as_json:
+    if common.as_json:
         print_json({**made.as_json(), "result": job.result})
         return
     _print_reconstruction(made, job.result or {})

@@ -24,16 +24,15 @@ from services.extractor.model_registry import (
     check_spec_matches,
     generation_spec_columns,
 )
-from shared.catalog.database.base import db_now
+from shared.catalog.database.base import db_now, insert_row
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, active_generation
 from shared.catalog.maps import Map, Matching, increment_map_version, lock_map
-from shared.catalog.vocabularies import VocabularyOrigin, add_vocabulary
+from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin
 from shared.descriptors.extractor import Extractor, spec_fingerprint
 from shared.descriptors.vocabulary import encode_centres
 from shared.errors import Conflict, PlacewiseError
 from shared.extractor_config.configs import pooled_config
-from shared.ids import new_id
 from shared.jobs import Job, JobKind
 from shared.jobs.model_changes import start_reindex
 from shared.storage.keys import new_vocabulary_key
@@ -104,17 +103,17 @@ def _create_first_generation(
         vocabulary_id, centres = None, None
         if shipped is not None:
             centres, provenance = shipped
-            vocabulary_id = add_vocabulary(
-                session,
-                map_id,
-                VocabularyOrigin.SHIPPED,
-                shape=centres.array.shape,
+            vocabulary = Vocabulary(
+                map_id=map_id,
+                origin=VocabularyOrigin.SHIPPED,
+                clusters=centres.clusters,
+                dimension=centres.dimension,
                 object_key=key,
                 sha256=centres.sha256,
                 provenance=provenance,
-            ).id
+            )
+            vocabulary_id = insert_row(session, vocabulary).id
         generation = Generation(
-            id=new_id(),
             map_id=map_id,
             state=GenerationState.ACTIVE,
             activated_at=db_now(),
@@ -123,8 +122,7 @@ def _create_first_generation(
                 session, DescriptorPipeline(extractor, centres), vocabulary_id
             ),
         )
-        session.add(generation)
-        session.flush()
+        insert_row(session, generation)
         increment_map_version(session, map_id)
     log.info("generation %s created with extractor %s", generation.id, extractor.config.name)
     return generation

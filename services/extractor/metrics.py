@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import partial
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
@@ -45,7 +44,7 @@ class ExtractorMetrics:
         counter = partial(Counter, namespace=METRIC_PREFIX, registry=registry)
         gauge = partial(Gauge, namespace=METRIC_PREFIX, registry=registry)
         histogram = partial(Histogram, namespace=METRIC_PREFIX, registry=registry)
-        self._batch_jobs = histogram(
+        self.batch_jobs = histogram(
             "batch_jobs", "Jobs per claimed batch.", ["kind"], buckets=BATCH_SIZE_BUCKETS
         )
         self._jobs = counter(
@@ -64,17 +63,13 @@ class ExtractorMetrics:
             ["stage"],
             buckets=STAGE_BUCKETS_SECONDS,
         )
-        self._load_seconds = histogram(
+        self.model_load_seconds = histogram(
             "model_load_seconds",
             "Duration of loading an extractor in seconds.",
             buckets=LOAD_BUCKETS_SECONDS,
         )
-        self._draining = gauge("draining", "1 while the worker processes jobs.")
+        self.draining = gauge("draining", "1 while the worker processes jobs.")
         registry.register(_DeviceMemoryCollector())
-
-    def observe_claim(self, kind: JobKind, jobs: int) -> None:
-        """Record the size of a claimed batch."""
-        self._batch_jobs.labels(kind).observe(jobs)
 
     def count_step_outcome(self, kind: JobKind, outcome: StepOutcome, jobs: int) -> None:
         """Count the jobs of a step that was not done; `observe_batch` counts the others."""
@@ -90,16 +85,6 @@ class ExtractorMetrics:
             self._failures.labels(batch.kind, reason).inc(jobs)
         for step, seconds in batch.seconds.items():
             self._stage_seconds.labels(step).observe(seconds)
-
-    def observe_model_load(self, seconds: float) -> None:
-        """Record the duration of loading an extractor."""
-        self._load_seconds.observe(seconds)
-
-    @contextlib.contextmanager
-    def measure_drain(self) -> Iterator[None]:
-        """Show that the worker processes jobs while the block runs."""
-        with self._draining.track_inprogress():
-            yield
 
 
 class _DeviceMemoryCollector(Collector):

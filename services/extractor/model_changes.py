@@ -10,14 +10,14 @@ from uuid import UUID
 
 from services.extractor.handlers import ExtractorContext, handles_model_change
 from services.extractor.model_registry import DescriptorPipeline, generation_spec_columns
+from shared.catalog.database.base import insert_row
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import Map
 from shared.catalog.photos import count_live_photos
 from shared.catalog.vocabularies import (
     StoredWhitening,
+    Vocabulary,
     VocabularyOrigin,
-    add_vocabulary,
-    add_whitening,
     get_vocabulary,
 )
 from shared.descriptors.extractor import Extractor
@@ -161,28 +161,29 @@ def start_generation(
             return
         params = {**leased.params, "done_before": progress_done}
         if centres and isinstance(vocabulary, NewVocabulary):
-            vocabulary_id = add_vocabulary(
-                session,
-                job.map_id,
-                vocabulary.origin,
-                shape=centres.array.shape,
+            stored_vocabulary = Vocabulary(
+                map_id=job.map_id,
+                origin=vocabulary.origin,
+                clusters=centres.clusters,
+                dimension=centres.dimension,
                 object_key=vocabulary_key,
                 sha256=centres.sha256,
                 provenance=vocabulary.provenance,
-            ).id
+            )
+            vocabulary_id = insert_row(session, stored_vocabulary).id
             params["vocabulary_id"] = str(vocabulary_id)
         if projection and isinstance(whitening, PcaWhiteningFile):
             fitted = whitening.whitening
-            whitening_id = add_whitening(
-                session,
-                job.map_id,
+            stored_whitening = StoredWhitening(
+                map_id=job.map_id,
                 dimension=fitted.dimension,
                 components=fitted.components,
                 rows=fitted.rows,
                 explained=fitted.explained,
                 object_key=whitening_key,
                 sha256=projection.sha256,
-            ).id
+            )
+            whitening_id = insert_row(session, stored_whitening).id
             params["whitening_id"] = str(whitening_id)
         columns = generation_spec_columns(session, pipeline, vocabulary_id, whitening_id)
         create_generation(session, leased, **columns)

@@ -113,7 +113,9 @@ class ExtractorWorker:
             return self._stop.is_set()
 
         load_added = AddedModelLoader(catalog, store, settings, is_stopping).load
-        models = ModelRegistry(store, settings, load_added, self._metrics.observe_model_load)
+        models = ModelRegistry(
+            store, settings, load_added, self._metrics.model_load_seconds.observe
+        )
         self.context = ExtractorContext(
             catalog, store, settings, models, decoders or DecoderPool(settings), is_stopping
         )
@@ -163,7 +165,7 @@ class ExtractorWorker:
         batch = self._claim() if self._runner.has_jobs() else None  # most looks find none
         if batch is None:
             return False
-        with self._metrics.measure_drain(), self._answering_queries():
+        with self._metrics.draining.track_inprogress(), self._answering_queries():
             try:
                 while batch is not None:
                     # Without the catalog, claimed jobs are requeued when their lease expires.
@@ -193,7 +195,7 @@ class ExtractorWorker:
         )
         if claimed is None:
             return None
-        self._metrics.observe_claim(claimed.kind, len(claimed.jobs))
+        self._metrics.batch_jobs.labels(claimed.kind).observe(len(claimed.jobs))
         batch = JobBatch(claimed.jobs, claimed.lease)
         batch.stages = HANDLERS[batch.kind](self.context, batch)
         return batch

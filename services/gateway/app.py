@@ -147,7 +147,10 @@ def _create_router() -> APIRouter:
     All applications of a process share it: FastAPI derives the parameters of each route at its
     first call, in a tenth of a second for all of them.
     """
-    router = APIRouter(responses=PROBLEM_RESPONSES)
+    # The id of an operation is the name of its function, unless a route has another one.
+    router = APIRouter(
+        responses=PROBLEM_RESPONSES, generate_unique_id_function=lambda route: route.name
+    )
     for module in RESOURCES:
         router.include_router(module.router, prefix=API_PREFIX, responses=AUTHENTICATION_RESPONSES)
     router.include_router(health.probe_router)

@@ -21,10 +21,12 @@ from fastapi import Depends, Query, Request
 from prometheus_client import CollectorRegistry, Counter
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.authentication import Authenticator, get_caller
 from services.http_connections import ConnectionLimits, Connections
+from shared.catalog.database.base import Condition, list_newest
 from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import UNFINISHED_STATES, get_job
 from shared.catalog.maps import DEFAULT_MAP, get_map
@@ -218,6 +220,13 @@ class PageParams(BaseModel):
         except ValueError:
             raise invalid_cursor_error() from None
 
+    def read(
+        self, session: Session, table: type[Row], *conditions: Condition
+    ) -> tuple[list[Row], str | None]:
+        """Read a page of the newest rows that match, and the cursor of the next one, if any."""
+        rows = list_newest(session, table, *conditions, limit=self.limit + 1, before=self.before)
+        return self.split(rows)
+
     def split(
         self, rows: list[Row], cursor_of: Callable[[Any], object] = lambda row: row.id
     ) -> tuple[list[Row], str | None]:
@@ -258,7 +267,6 @@ ALL_MAPS = Depends(_require_all_maps)
 """Dependency of endpoints about no map or all maps: keys for some maps are refused."""
 GatewayDep = Annotated[GatewayContext, Depends(_get_gateway_context)]
 FileId = Annotated[UUID, _uuid_or_not_found("photo")]
-UploadId = Annotated[UUID, _uuid_or_not_found("upload")]
 JobId = Annotated[UUID, _uuid_or_not_found("job")]
 GenerationId = Annotated[UUID, _uuid_or_not_found("generation")]
 KeyId = Annotated[UUID, _uuid_or_not_found("key")]

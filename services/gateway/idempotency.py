@@ -33,7 +33,7 @@ from starlette.concurrency import run_in_threadpool
 from services.gateway.authentication import get_caller
 from services.gateway.dependencies import GatewayContext, GatewayDep, get_map_name
 from services.gateway.responses import JobAcceptedResponse
-from shared.catalog.database.base import db_now_plus
+from shared.catalog.database.base import db_now_plus, insert_row
 from shared.catalog.idempotency import StoredResponse, find_response, store_response
 from shared.errors import PlacewiseError, invalid_field_error
 from shared.ingest.validation import StoredUpload
@@ -157,8 +157,7 @@ class IdempotentRequest:
 
     def store_job_response(self, session: Session, job: Job) -> JobAcceptedResponse:
         """Add a job to the transaction, and store and return its 202 response."""
-        session.add(job)
-        session.flush()
+        insert_row(session, job)
         accepted = JobAcceptedResponse.of(job, get_map_name(self._request))
         self.store_response(session, 202, accepted, accepted.headers)
         return accepted

@@ -12,7 +12,6 @@ from services.http_server import http_server, listen, reachable_url, stop_on_sig
 from services.service_process import Announce, service_process
 from shared.catalog.api_keys import has_admin_key
 from shared.catalog.database.session import REQUEST_TIMEOUTS, Catalog
-from shared.catalog.generations import RowType
 from shared.catalog.installation import open_installation_store
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.processes import process_heartbeat
@@ -40,9 +39,7 @@ def serve_gateway(settings: Settings, announce: Announce) -> None:
         url = reachable_url(*listener.getsockname()[:2])
         admin_key_hashes = _admin_key_hashes(settings, catalog)
         with catalog.write() as session:
-            get_or_create_default_map(
-                session, settings.new_map_extractor, RowType(settings.descriptor_rows)
-            )
+            get_or_create_default_map(session, settings.new_map_extractor, settings.descriptor_rows)
         store = open_installation_store(catalog, settings, exclusive=False)
         requests = catalog.with_timeouts(REQUEST_TIMEOUTS)
         keys = ApiKeyAuthenticator(requests, *admin_key_hashes)

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
 from functools import partial
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
-from prometheus_client.core import GaugeMetricFamily
-from prometheus_client.metrics_core import Metric
-from prometheus_client.registry import Collector
 
 from shared.jobs import JobKind
 from shared.jobs.runner import StepOutcome
@@ -54,8 +50,11 @@ class StewardMetrics:
             "Slices of the steward's own jobs by outcome: done, requeued, paused, failed, crashed.",
             ["kind", "outcome"],
         )
-        self._last_success: dict[str, float] = {}
-        registry.register(_TaskLagCollector(self._last_success))
+        self._task_lag = gauge(
+            "task_lag_seconds",
+            "Seconds since the last successful run of the periodic task.",
+            ["task"],
+        )
 
     def observe_task(self, name: str, outcome: str, seconds: float) -> None:
         """Record a run of a periodic task."""
@@ -63,24 +62,9 @@ class StewardMetrics:
         self._task_runs.labels(task, outcome).inc()
         self._task_seconds.labels(task).observe(seconds)
         if outcome == "done":
-            self._last_success[task] = time.monotonic()
+            succeeded_at = time.monotonic()
+            self._task_lag.labels(task).set_function(lambda: time.monotonic() - succeeded_at)
 
     def count_jobs(self, kind: JobKind, outcome: StepOutcome, jobs: int) -> None:
         """Record a slice of the steward's own jobs."""
         self._jobs.labels(kind, outcome).inc(jobs)
-
-
-class _TaskLagCollector(Collector):
-    def __init__(self, last_success: Mapping[str, float]) -> None:
-        self._last_success = last_success
-
-    def collect(self) -> Iterable[Metric]:
-        lag = GaugeMetricFamily(
-            f"{METRIC_PREFIX}_task_lag_seconds",
-            "Seconds since the last successful run of the periodic task.",
-            labels=["task"],
-        )
-        now = time.monotonic()
-        for task, succeeded_at in dict(self._last_success).items():
-            lag.add_metric([task], now - succeeded_at)
-        yield lag

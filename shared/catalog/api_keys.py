@@ -11,33 +11,31 @@ from dataclasses import dataclass
 from datetime import datetime
 from uuid import UUID
 
-from sqlalchemy import BigInteger, Integer, String, Text, Uuid, or_, select, update
+from sqlalchemy import BigInteger, Integer, String, Text, or_, select, update
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.database.base import (
-    Base,
+    Entity,
     Journaled,
     JsonValue,
     UtcDateTime,
     count_rows,
     db_now,
     db_now_plus,
-    list_newest,
+    insert_row,
 )
 from shared.catalog.maps import MAP_NAME_PATTERN
 from shared.catalog.photos import Photo
 from shared.catalog.tracks import Track, TrackFrame
 from shared.errors import NotFound, Unauthorized, invalid_field_error
-from shared.ids import new_id
 from shared.security.api_keys import Scope, api_key_prefix, generate_api_key, hash_api_key
 
 
-class ApiKey(Journaled, Base):
+class ApiKey(Journaled, Entity):
     """An API key. A limit that is null defaults to the one of the settings."""
 
     __tablename__ = "api_keys"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     name: Mapped[str] = mapped_column(Text)
     prefix: Mapped[str] = mapped_column(String(20))
     sha256: Mapped[str] = mapped_column(String(64), unique=True)
@@ -100,9 +98,7 @@ def create_api_key(
         requests_per_minute=limits.requests_per_minute,
         max_photos=limits.max_photos,
     )
-    session.add(row)
-    session.flush()
-    session.refresh(row)
+    session.refresh(insert_row(session, row))
     return row, key
 
 
@@ -129,11 +125,6 @@ def authenticate_api_key(session: Session, sha256: str) -> ApiKey:
             "create another one: placewise keys create.",
         )
     return key
-
-
-def list_api_keys(session: Session) -> list[ApiKey]:
-    """List all keys, also revoked and expired ones, newest first."""
-    return list_newest(session, ApiKey)
 
 
 def revoke_api_key(session: Session, key_id: UUID) -> ApiKey:

@@ -24,9 +24,8 @@ from uuid import UUID
 import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.database.base import Base, JsonValue, count_rows, partial_index
+from shared.catalog.database.base import Base, JsonValue, count_rows, insert_row, partial_index
 from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState, Priority
-from shared.ids import new_id
 
 ITEMS_PER_STATEMENT = 1000  # rows inserted, or jobs selected, by one statement
 
@@ -74,16 +73,12 @@ def create_batch(
 ) -> Job:
     """Queue a batch without items."""
     job = Job(
-        id=new_id(),
         map_id=map_id,
         kind=JobKind.BATCH,
-        priority=Priority.BATCH,
         params={"source": source, "listed": False, **(params or {})},
         progress_total=0,
     )
-    session.add(job)
-    session.flush()
-    return job
+    return insert_row(session, job)
 
 
 def add_batch_items(session: Session, job: Job, items: Iterable[dict[str, Any]]) -> None:

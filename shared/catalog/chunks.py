@@ -14,11 +14,17 @@ from uuid import UUID
 import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.database.base import Base, UtcDateTime, count_rows, db_now, partial_index
+from shared.catalog.database.base import (
+    Base,
+    Entity,
+    UtcDateTime,
+    count_rows,
+    db_now,
+    partial_index,
+)
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import Job, JobState
 from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole, is_geotagged, is_kept
-from shared.ids import new_id
 from shared.storage.chunks import features_key
 
 # Up to this number, rows are counted per request, which takes about 10 ms.
@@ -27,7 +33,7 @@ MAX_EXACT_COUNT = 10_000
 IDS_PER_QUERY = 1000  # maximum of photo ids in one statement
 
 
-class Chunk(Base):
+class Chunk(Entity):
     """An immutable `.npy` file of `rows` descriptors, with its SHA-256.
 
     The columns `features_*` describe its feature file: the model of the local features (null: there
@@ -36,7 +42,6 @@ class Chunk(Base):
 
     __tablename__ = "chunks"
 
-    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
     generation_id: Mapped[UUID] = mapped_column(
         sa.Uuid, sa.ForeignKey("generations.id"), index=True
     )

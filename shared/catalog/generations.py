@@ -14,22 +14,20 @@ from sqlalchemy import BigInteger, Boolean, ForeignKey, Index, Integer, String, 
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.database.base import (
-    Base,
+    Entity,
     Journaled,
     JsonValue,
     UtcDateTime,
     db_now,
     for_update,
-    get_in_map,
     list_newest,
     partial_index,
 )
 from shared.enums import GenerationState as GenerationState
 from shared.enums import RowType as RowType
-from shared.ids import new_id
 
 
-class Generation(Journaled, Base):
+class Generation(Journaled, Entity):
     """A generation. `spec` has everything that determines a descriptor's value.
 
     `calibration` is a `shared.evaluation.places.PlaceModel`, fitted by evaluations.
@@ -37,7 +35,6 @@ class Generation(Journaled, Base):
 
     __tablename__ = "generations"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"), index=True)
     state: Mapped[GenerationState] = mapped_column(String(20))
     extractor: Mapped[str] = mapped_column(String(200))
@@ -96,11 +93,6 @@ def active_generation(session: Session, map_id: UUID) -> Generation | None:
     )
 
 
-def get_generation(session: Session, map_id: UUID, generation_id: UUID) -> Generation:
-    """Return a generation of the map; NotFound (`generation_not_found`)."""
-    return get_in_map(session, Generation, map_id, generation_id)
-
-
 def lock_generation(session: Session, generation_id: UUID) -> Generation:
     """Lock the generation's row until the end of the transaction, and return it refreshed."""
     return session.scalars(
@@ -108,17 +100,11 @@ def lock_generation(session: Session, generation_id: UUID) -> Generation:
     ).one()
 
 
-def list_generations(session: Session, map_id: UUID) -> list[Generation]:
-    """List the map's generations, newest first."""
-    return list_newest(session, Generation, Generation.map_id == map_id)
-
-
-class Evaluation(Journaled, Base):
+class Evaluation(Journaled, Entity):
     """The metrics of an evaluation; `searchable` is the number of searchable photos back then."""
 
     __tablename__ = "evaluations"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"))
     generation_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("generations.id"))
     automatic: Mapped[bool] = mapped_column(Boolean, default=False)
@@ -131,14 +117,6 @@ class Evaluation(Journaled, Base):
         Index("ix_evaluations_map_id", "map_id", "id"),
         Index("ix_evaluations_generation", "generation_id", "id"),
     )
-
-
-def list_evaluations(
-    session: Session, map_id: UUID, limit: int, before: UUID | None = None
-) -> list[Evaluation]:
-    """List the map's evaluations, newest first, up to `limit`; `before` is the page's cursor."""
-    is_of_map = Evaluation.map_id == map_id
-    return list_newest(session, Evaluation, is_of_map, limit=limit, before=before)
 
 
 def latest_evaluation(session: Session, generation_id: UUID) -> Evaluation | None:

@@ -7,17 +7,15 @@ the same time, one commits, because `scope` and `key` are unique.
 from __future__ import annotations
 
 from datetime import datetime
-from uuid import UUID
 
-from sqlalchemy import Index, Integer, Select, String, Text, UniqueConstraint, Uuid, select
+from sqlalchemy import Index, Integer, Select, String, Text, UniqueConstraint, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.database.base import Base, JsonValue, UtcDateTime, db_now, get_or_insert
+from shared.catalog.database.base import Entity, JsonValue, UtcDateTime, db_now, get_or_insert
 from shared.errors import Unprocessable
-from shared.ids import new_id
 
 
-class StoredResponse(Base):
+class StoredResponse(Entity):
     """The response of a request. `scope` is the caller: two callers may use the same key.
 
     `fingerprint` is the SHA-256 of the request, in hexadecimal; `body` is JSON, as it was sent.
@@ -25,7 +23,6 @@ class StoredResponse(Base):
 
     __tablename__ = "idempotency_keys"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     scope: Mapped[str] = mapped_column(String(200))
     key: Mapped[str] = mapped_column(String(255))
     fingerprint: Mapped[str] = mapped_column(String(64))

@@ -34,8 +34,8 @@ from sqlalchemy import Boolean, ForeignKey, Index, Integer, Select, String, Uuid
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.database.base import (
-    Base,
     Condition,
+    Entity,
     JsonValue,
     UtcDateTime,
     db_now,
@@ -45,7 +45,6 @@ from shared.catalog.database.base import (
     partial_index,
 )
 from shared.enums import JobState as JobState
-from shared.ids import new_id
 from shared.telemetry.request_ids import (
     MAX_REQUEST_ID_CHARACTERS,
     current_request_id,
@@ -77,11 +76,23 @@ class RunBy(StrEnum):
     STEWARD = "steward"  # jobs that need only search
 
 
+class Priority(IntEnum):
+    """Higher is claimed first; within one priority, older is claimed first."""
+
+    QUERY = 100  # a client waits for the result
+    UPLOAD = 50
+    BATCH = 40  # also of its photos, so that a single upload does not wait for thousands
+    MODEL_CHANGE = 20
+    REINDEX = 10
+    EVALUATION = 5
+
+
 @dataclass(frozen=True, slots=True)
 class JobType:
     """How the jobs of a kind are shown and run."""
 
     title: str  # in plain words, for the page and the command
+    priority: Priority  # of its jobs, unless they have another one
     run_by: RunBy = RunBy.EXTRACTOR
     in_batches: bool = False  # claimed together: each is the description of one photo
     changes_model: bool = False  # one at a time in each map, in slices, up to a switch
@@ -91,18 +102,24 @@ class JobType:
 
 
 JOB_TYPES = {
-    JobKind.INDEX: JobType("Photo", in_batches=True),
-    JobKind.REINDEX: JobType("Photo for a new model", in_batches=True, on_status_page=False),
-    JobKind.DESCRIBE: JobType("Query photo", in_batches=True, on_status_page=False),
-    JobKind.FIT: JobType("Improving the map", RunBy.FIT_WORKER, changes_model=True),
-    JobKind.IMPORT: JobType("Vocabulary import", changes_model=True),
-    JobKind.SWITCH: JobType("Switch", changes_model=True),
-    JobKind.PCA: JobType("PCA", RunBy.FIT_WORKER, changes_model=True),
-    JobKind.ADD_MODEL: JobType("New model", has_upload=True),
-    JobKind.EVALUATE: JobType("Evaluation", RunBy.STEWARD),
-    JobKind.RECONSTRUCT: JobType("Reconstruction", RunBy.FIT_WORKER, has_upload=True),
-    JobKind.SYNC_LIBRARY: JobType("Photo library", RunBy.STEWARD),
-    JobKind.BATCH: JobType("Batch", RunBy.STEWARD, in_slices=True),
+    JobKind.INDEX: JobType("Photo", Priority.UPLOAD, in_batches=True),
+    JobKind.REINDEX: JobType(
+        "Photo for a new model", Priority.REINDEX, in_batches=True, on_status_page=False
+    ),
+    JobKind.DESCRIBE: JobType("Query photo", Priority.QUERY, in_batches=True, on_status_page=False),
+    JobKind.FIT: JobType(
+        "Improving the map", Priority.MODEL_CHANGE, RunBy.FIT_WORKER, changes_model=True
+    ),
+    JobKind.IMPORT: JobType("Vocabulary import", Priority.MODEL_CHANGE, changes_model=True),
+    JobKind.SWITCH: JobType("Switch", Priority.MODEL_CHANGE, changes_model=True),
+    JobKind.PCA: JobType("PCA", Priority.MODEL_CHANGE, RunBy.FIT_WORKER, changes_model=True),
+    JobKind.ADD_MODEL: JobType("New model", Priority.MODEL_CHANGE, has_upload=True),
+    JobKind.EVALUATE: JobType("Evaluation", Priority.EVALUATION, RunBy.STEWARD),
+    JobKind.RECONSTRUCT: JobType(
+        "Reconstruction", Priority.MODEL_CHANGE, RunBy.FIT_WORKER, has_upload=True
+    ),
+    JobKind.SYNC_LIBRARY: JobType("Photo library", Priority.BATCH, RunBy.STEWARD),
+    JobKind.BATCH: JobType("Batch", Priority.BATCH, RunBy.STEWARD, in_slices=True),
 }
 
 
@@ -124,17 +141,6 @@ STATUS_PAGE_JOBS = _kinds(lambda kind: kind.on_status_page)
 QUERY_TTL_SECONDS = 3600.0
 
 
-class Priority(IntEnum):
-    """Higher is claimed first; within one priority, older is claimed first."""
-
-    QUERY = 100  # a client waits for the result
-    UPLOAD = 50
-    BATCH = 40  # also of its photos, so that a single upload does not wait for thousands
-    MODEL_CHANGE = 20
-    REINDEX = 10
-    EVALUATION = 5
-
-
 class WaitingFor(StrEnum):
     DESCRIPTORS = "descriptors"  # every photo has to be described into the new generation
     SEARCH = "search"  # every live search worker has to load the new generation
@@ -146,16 +152,20 @@ def _ready_condition(state: Any, lease_token: Any, waiting_for: Any) -> Conditio
     return and_(state.in_(UNFINISHED_STATES), lease_token.is_(None), waiting_for.is_(None))
 
 
-class Job(Base):
+def _priority_of_kind(context: Any) -> Priority:
+    """Return the default priority of a row that is being inserted."""
+    return JOB_TYPES[context.get_current_parameters()["kind"]].priority
+
+
+class Job(Entity):
     """A job. See the module's docstring for `state`, `attempts` and the lease."""
 
     __tablename__ = "jobs"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"))
     kind: Mapped[JobKind] = mapped_column(String(30))
     state: Mapped[JobState] = mapped_column(String(20), default=JobState.QUEUED)
-    priority: Mapped[int] = mapped_column(Integer)
+    priority: Mapped[int] = mapped_column(Integer, default=_priority_of_kind)
     photo_id: Mapped[UUID | None] = mapped_column(Uuid, ForeignKey("photos.id"), index=True)
     generation_id: Mapped[UUID | None] = mapped_column(Uuid, ForeignKey("generations.id"))
     params: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)

@@ -28,6 +28,7 @@ from shared.catalog.chunks import (
 )
 from shared.catalog.database.base import (
     Base,
+    Entity,
     Journaled,
     JsonValue,
     UtcDateTime,
@@ -36,7 +37,7 @@ from shared.catalog.database.base import (
     db_now_plus,
     for_update,
     get_or_insert,
-    list_newest,
+    insert_row,
 )
 from shared.catalog.generations import (
     Generation,
@@ -54,7 +55,6 @@ from shared.catalog.photos import (
 )
 from shared.enums import Matching as Matching
 from shared.errors import Conflict, NotFound
-from shared.ids import new_id
 from shared.place_paths import look_like_paths
 
 DEFAULT_MAP = "default"
@@ -62,12 +62,11 @@ MAP_NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 DELETED_NAME_PREFIX = "deleted/"  # valid names of maps have no slash
 
 
-class Map(Journaled, Base):
+class Map(Journaled, Entity):
     """A map. Every transaction that changes its search results increments `version`."""
 
     __tablename__ = "maps"
 
-    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
     name: Mapped[str] = mapped_column(sa.String(100), unique=True)
     extractor: Mapped[str] = mapped_column(sa.String(200))
     version: Mapped[int] = mapped_column(sa.BigInteger, default=0)
@@ -112,7 +111,6 @@ def create_map(
     With None, its labels decide whether they are paths.
     """
     map_ = Map(
-        id=new_id(),
         name=name,
         extractor=extractor,
         place_labels_are_paths=bool(place_labels_are_paths),
@@ -124,11 +122,9 @@ def create_map(
     )
     try:
         with session.begin_nested():
-            session.add(map_)
-            session.flush()
+            return insert_row(session, map_)
     except IntegrityError:
         raise Conflict("map_exists", f"A map named {name!r} already exists.", map=name) from None
-    return map_
 
 
 def list_maps(session: Session) -> list[Map]:
@@ -168,11 +164,11 @@ def mark_map_deleted(session: Session, map_: Map) -> None:
 
 
 def get_or_create_default_map(
-    session: Session, extractor: str, row_type: RowType = RowType.FLOAT32
+    session: Session, extractor: str, row_type: str = RowType.FLOAT32
 ) -> Map:
     """Return the map named `default`, created on first use."""
     named_default = sa.select(Map).where(Map.name == DEFAULT_MAP)
-    new = Map(name=DEFAULT_MAP, extractor=extractor, row_type=row_type)
+    new = Map(name=DEFAULT_MAP, extractor=extractor, row_type=RowType(row_type))
     return get_or_insert(session, named_default, new)
 
 
@@ -237,12 +233,11 @@ def decide_label_paths(session: Session, map_: Map) -> bool:
     return 2 * sum(labels.values()) > located and look_like_paths(labels)
 
 
-class Search(Base):
+class Search(Entity):
     """A completed similarity search, for the history and the statistics."""
 
     __tablename__ = "searches"
 
-    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
     map_id: Mapped[UUID] = mapped_column(sa.Uuid, sa.ForeignKey("maps.id"))
     generation_id: Mapped[UUID] = mapped_column(sa.Uuid)
     query_photo_id: Mapped[UUID | None] = mapped_column(sa.Uuid)
@@ -264,13 +259,6 @@ class Search(Base):
         sa.Index("ix_searches_map_id", "map_id", "id"),
         sa.Index("ix_searches_time", "searched_at"),
     )
-
-
-def list_searches(
-    session: Session, map_id: UUID, limit: int, before: UUID | None = None
-) -> list[Search]:
-    """List the map's searches, newest first, up to `limit`; `before` is the page's cursor."""
-    return list_newest(session, Search, Search.map_id == map_id, limit=limit, before=before)
 
 
 RECENT_SEARCHES = 100

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from datetime import datetime
 from typing import Any
-from uuid import UUID
 
 import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.database.base import (
-    Base,
+    Entity,
     Journaled,
     JsonValue,
     UtcDateTime,
@@ -28,10 +27,9 @@ from shared.catalog.maps import Map
 from shared.errors import Conflict, Misconfigured, NotFound, PlacewiseError
 from shared.extractor_config.configs import ExtractorConfig, get_extractor_config
 from shared.extractor_config.names import ModelName
-from shared.ids import new_id
 
 
-class Model(Journaled, Base):
+class Model(Journaled, Entity):
     """A set of weights. `card` has their source and licence.
 
     The columns from `added_name` on are those of an added model: its weights are a file of
@@ -43,7 +41,6 @@ class Model(Journaled, Base):
 
     __tablename__ = "models"
 
-    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
     name: Mapped[str] = mapped_column(sa.String(200))
     fingerprint: Mapped[str] = mapped_column(sa.String(64))
     licence: Mapped[str] = mapped_column(sa.Text)

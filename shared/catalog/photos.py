@@ -12,9 +12,9 @@ import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.database.base import (
-    Base,
     Condition,
     CoordinateColumn,
+    Entity,
     Journaled,
     JsonValue,
     UtcDateTime,
@@ -27,11 +27,10 @@ from shared.catalog.database.base import (
 )
 from shared.enums import PhotoRole as PhotoRole
 from shared.errors import NotFound
-from shared.ids import new_id
 from shared.search_api.photo_filter import is_part_of_tag
 
 
-class Photo(Journaled, Base):
+class Photo(Journaled, Entity):
     """A live or deleted photo. `sha256` is unique among the live photos of a map.
 
     So is `picture_sha256`, the hash of its path and of the file without metadata; null if unknown.
@@ -46,7 +45,6 @@ class Photo(Journaled, Base):
 
     __tablename__ = "photos"
 
-    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
     map_id: Mapped[UUID] = mapped_column(sa.Uuid, sa.ForeignKey("maps.id"))
     job_id: Mapped[UUID | None] = mapped_column(sa.Uuid)
     role: Mapped[PhotoRole] = mapped_column(

@@ -20,12 +20,12 @@ from importlib.metadata import version
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import String, Uuid, and_, delete, or_, select, update
+from sqlalchemy import String, and_, delete, or_, select, update
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.database.base import (
-    Base,
+    Entity,
     JsonValue,
     UtcDateTime,
     db_now,
@@ -43,12 +43,11 @@ PROCESS_TIMEOUT_SECONDS = 35.0  # three missed heartbeats
 PROCESS_RETENTION_SECONDS = 86_400.0
 
 
-class RegisteredProcess(Base):
+class RegisteredProcess(Entity):
     """A running process; `role` is the name of its command, `state` what it reports of itself."""
 
     __tablename__ = "live_processes"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     role: Mapped[str] = mapped_column(String(20))
     name: Mapped[str] = mapped_column(String(200))
     release: Mapped[str] = mapped_column(String(30))

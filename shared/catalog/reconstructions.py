@@ -15,10 +15,9 @@ from pydantic import BaseModel, ConfigDict
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.chunks import count_searchable, find_features_model
-from shared.catalog.database.base import Base, Journaled, JsonValue, UtcDateTime, db_now
+from shared.catalog.database.base import Entity, Journaled, JsonValue, UtcDateTime, db_now
 from shared.catalog.generations import Generation, active_generation
 from shared.errors import Conflict, NotFound
-from shared.ids import new_id
 from shared.storage import ObjectStore
 from shared.storage.keys import reconstruction_prefix
 
@@ -68,7 +67,7 @@ class ReconstructedComponent(BaseModel):
     """a `shared.geometry.radius.PoseCalibration`; None if it could not be measured"""
 
 
-class Reconstruction(Journaled, Base):
+class Reconstruction(Journaled, Entity):
     """A reconstruction of a map's photos.
 
     `features_model` is that of the local features that its points refer to: no query with features
@@ -79,7 +78,6 @@ class Reconstruction(Journaled, Base):
 
     __tablename__ = "reconstructions"
 
-    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
     map_id: Mapped[UUID] = mapped_column(sa.Uuid, sa.ForeignKey("maps.id"))
     job_id: Mapped[UUID] = mapped_column(sa.Uuid, index=True)
     generation_id: Mapped[UUID] = mapped_column(

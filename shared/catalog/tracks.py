@@ -20,18 +20,17 @@ import sqlalchemy as sa
 from sqlalchemy.orm import Mapped, Session, aliased, defer, mapped_column
 
 from shared.catalog.database.base import (
-    Base,
     Condition,
+    Entity,
     JsonValue,
     UtcDateTime,
     count_rows,
     db_now,
     get_in_map,
-    list_newest,
+    insert_row,
     partial_index,
 )
 from shared.errors import Conflict, NotFound
-from shared.ids import new_id
 
 MAX_TRACK_FRAMES = 10_000
 RETENTION_DAYS = 30.0  # after the last frame; as long as finished jobs
@@ -40,12 +39,11 @@ MAX_LATE_FRAMES = 50
 """A frame may be inserted before at most so many frames of its track."""
 
 
-class Track(Base):
+class Track(Entity):
     """A track. `params` has the motion model and the start."""
 
     __tablename__ = "tracks"
 
-    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
     map_id: Mapped[UUID] = mapped_column(sa.Uuid, sa.ForeignKey("maps.id"))
     params: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
     version: Mapped[int] = mapped_column(sa.Integer, default=0)
@@ -65,12 +63,11 @@ class Track(Base):
     )
 
 
-class TrackFrame(Base):
+class TrackFrame(Entity):
     """A frame of a track. It is pending while `state` and `error` are both None."""
 
     __tablename__ = "track_frames"
 
-    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id)
     track_id: Mapped[UUID] = mapped_column(sa.Uuid, sa.ForeignKey("tracks.id"))
     captured_at: Mapped[datetime] = mapped_column(UtcDateTime)
     version: Mapped[int] = mapped_column(sa.Integer)
@@ -115,11 +112,6 @@ def is_pending() -> Condition:
 def get_track(session: Session, map_id: UUID, track_id: UUID, *, lock: bool = False) -> Track:
     """Return a track of the map; NotFound (`track_not_found`)."""
     return get_in_map(session, Track, map_id, track_id, lock=lock)
-
-
-def list_tracks(session: Session, map_id: UUID, limit: int, before: UUID | None) -> list[Track]:
-    """List the map's tracks, newest first; `before` is the page's cursor."""
-    return list_newest(session, Track, Track.map_id == map_id, limit=limit, before=before)
 
 
 def get_frame(session: Session, track_id: UUID, frame_id: UUID) -> TrackFrame:
@@ -251,9 +243,7 @@ def add_frame(
     track.version += 1
     track.updated_at = db_now()
     frame.version = track.version
-    session.add(frame)
-    session.flush()
-    return frame
+    return insert_row(session, frame)
 
 
 def latest_states(session: Session, track_ids: list[UUID]) -> dict[UUID, TrackFrame]:

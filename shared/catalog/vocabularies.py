@@ -10,13 +10,12 @@ from sqlalchemy import Float, ForeignKey, Integer, String, Text, Uuid
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.database.base import (
-    Base,
+    Entity,
     Journaled,
     JsonValue,
     UtcDateTime,
     db_now,
     get_in_map,
-    list_newest,
 )
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import Map
@@ -26,10 +25,9 @@ from shared.extractor_config.configs import (
     MIN_PHOTOS_TO_FIT,
     get_extractor_config,
 )
-from shared.ids import new_id
 
 
-class Vocabulary(Journaled, Base):
+class Vocabulary(Journaled, Entity):
     """A vocabulary: (clusters, dimension) float32 centres in a `.npy` file under `object_key`.
 
     `provenance` is that of `shared.descriptors.vocabulary_file`.
@@ -37,7 +35,6 @@ class Vocabulary(Journaled, Base):
 
     __tablename__ = "vocabularies"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"), index=True)
     origin: Mapped[VocabularyOrigin] = mapped_column(String(20))
     clusters: Mapped[int] = mapped_column(Integer)
@@ -90,43 +87,12 @@ def next_fit_photos(session: Session, map_: Map) -> int | None:
     return max(MIN_PHOTOS_TO_FIT, 2 * (map_.fitted_photos or 0))
 
 
-def add_vocabulary(
-    session: Session,
-    map_id: UUID,
-    origin: VocabularyOrigin,
-    *,
-    shape: tuple[int, int],
-    object_key: str,
-    sha256: str,
-    provenance: dict[str, Any],
-) -> Vocabulary:
-    """Register the centres stored under `object_key`; `shape` is (clusters, dimension)."""
-    vocabulary = Vocabulary(
-        id=new_id(),
-        map_id=map_id,
-        origin=origin,
-        clusters=shape[0],
-        dimension=shape[1],
-        object_key=object_key,
-        sha256=sha256,
-        provenance=provenance,
-    )
-    session.add(vocabulary)
-    session.flush()
-    return vocabulary
-
-
 def get_vocabulary(session: Session, map_id: UUID, vocabulary_id: UUID) -> Vocabulary:
     """Return a vocabulary of the map; NotFound (`vocabulary_not_found`)."""
     return get_in_map(session, Vocabulary, map_id, vocabulary_id)
 
 
-def list_vocabularies(session: Session, map_id: UUID) -> list[Vocabulary]:
-    """List the map's vocabularies, newest first."""
-    return list_newest(session, Vocabulary, Vocabulary.map_id == map_id)
-
-
-class StoredWhitening(Journaled, Base):
+class StoredWhitening(Journaled, Entity):
     """A PCA whitening from `dimension` to `components`, stored under `object_key`.
 
     The file is one of `shared.descriptors.pca_whitening`. It is deleted after a grace period when
@@ -135,7 +101,6 @@ class StoredWhitening(Journaled, Base):
 
     __tablename__ = "whitenings"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"), index=True)
     dimension: Mapped[int] = mapped_column(Integer)
     components: Mapped[int] = mapped_column("kept", Integer)
@@ -178,11 +143,3 @@ def get_pca_source_generation(session: Session, map_id: UUID) -> Generation:
             dimension=active.dimension,
         )
     return active
-
-
-def add_whitening(session: Session, map_id: UUID, **columns: Any) -> StoredWhitening:
-    """Register a whitening that is stored under `object_key`."""
-    whitening = StoredWhitening(id=new_id(), map_id=map_id, **columns)
-    session.add(whitening)
-    session.flush()
-    return whitening

@@ -19,12 +19,12 @@ from sqlalchemy import Index, Integer, String, Text, Uuid, delete, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.database.base import (
-    Base,
+    Entity,
     Journaled,
     JsonValue,
     UtcDateTime,
     db_now,
-    list_newest,
+    insert_row,
     partial_index,
 )
 from shared.errors import NotFound
@@ -47,7 +47,7 @@ class DeliveryState(StrEnum):
     FAILED = "failed"  # no more attempts
 
 
-class Webhook(Journaled, Base):
+class Webhook(Journaled, Entity):
     """A webhook. Its secret signs the events, so it is stored in plain text, also in the journal.
 
     A deleted one keeps its row, without the secret: the journal records its deletion.
@@ -55,7 +55,6 @@ class Webhook(Journaled, Base):
 
     __tablename__ = "webhooks"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     url: Mapped[str] = mapped_column(Text)
     events: Mapped[list[str]] = mapped_column(JsonValue)
     secret: Mapped[str] = mapped_column(Text)
@@ -63,7 +62,7 @@ class Webhook(Journaled, Base):
     deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
 
-class Delivery(Base):
+class Delivery(Entity):
     """One event for one webhook.
 
     It has no foreign key to the webhook, because the deletion of a webhook must not block the
@@ -72,7 +71,6 @@ class Delivery(Base):
 
     __tablename__ = "webhook_deliveries"
 
-    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     webhook_id: Mapped[UUID] = mapped_column(Uuid)
     event_id: Mapped[UUID] = mapped_column(Uuid)  # the same for all attempts and webhooks
     event: Mapped[EventKind] = mapped_column(String(50))
@@ -101,9 +99,7 @@ def create_webhook(session: Session, url: str, events: list[EventKind]) -> Webho
     """
     secret = SECRET_PREFIX + base64.b64encode(secrets.token_bytes(SECRET_BYTES)).decode()
     webhook = Webhook(url=url, events=sorted(set(events)), secret=secret)
-    session.add(webhook)
-    session.flush()
-    session.refresh(webhook)
+    session.refresh(insert_row(session, webhook))
     return webhook
 
 
@@ -115,25 +111,12 @@ def get_webhook(session: Session, webhook_id: UUID) -> Webhook:
     return webhook
 
 
-def list_webhooks(session: Session) -> list[Webhook]:
-    """List all webhooks, newest first."""
-    return list_newest(session, Webhook, Webhook.deleted_at.is_(None))
-
-
 def delete_webhook(session: Session, webhook_id: UUID) -> Webhook:
     """Delete a webhook with all its deliveries, also pending ones; NotFound."""
     webhook = get_webhook(session, webhook_id)
     session.execute(delete(Delivery).where(Delivery.webhook_id == webhook_id))
     webhook.secret, webhook.deleted_at = "", db_now()
     return webhook
-
-
-def list_deliveries(
-    session: Session, webhook_id: UUID, limit: int, before: UUID | None
-) -> list[Delivery]:
-    """List the webhook's deliveries, newest first, up to `limit`; `before` is the page's cursor."""
-    is_of_webhook = Delivery.webhook_id == webhook_id
-    return list_newest(session, Delivery, is_of_webhook, limit=limit, before=before)
 
 
 def subscribed_webhook_ids(session: Session, event: EventKind) -> list[UUID]:

@@ -64,13 +64,13 @@ class ExtractorConfig:
     """Name of the network."""
     implementation: str
     """Its `Backbone`, `module:class` of `shared.descriptors.backbones`."""
-    width: int | None
+    width: int | None = None
     """Dimension of a local feature; None where only the loaded network determines it."""
-    parameters: int | None
+    parameters: int | None = None
     """Number of parameters of the backbone, rounded up, 4 bytes each; None as for `width`."""
-    preprocessing: str | None
+    preprocessing: str | None = None
     """A name of `shared.imaging.preprocessing.get_preprocessing`; None as for `width`."""
-    aggregator: str
+    aggregator: str = "none"
     """One of EXTRACTOR_AGGREGATORS, or `none` where the backbone computes the global descriptor.
 
     Hard and soft VLAD need a vocabulary; GeM and average pooling don't.
@@ -156,27 +156,34 @@ def _anyloc_config(
     )
 
 
+_EFFICIENTNET = ExtractorConfig(
+    name="efficientnet-lite0-vlad",
+    backbone="efficientnet-lite0",
+    implementation="efficientnet_lite0:EfficientNetLite0",
+    width=112,
+    parameters=5_000_000,
+    preprocessing="square224",
+    aggregator="vlad",
+    shipped_vocabulary="efficientnet-lite0.npy",
+)
+_TINY = ExtractorConfig(
+    name="test-tiny-avg",
+    backbone="test-tiny",
+    implementation="synthetic:TinyBackbone",
+    width=16,
+    parameters=1_000,
+    preprocessing="square32",
+    aggregator="avg",
+    for_tests=True,
+)
 EXTRACTOR_CONFIGS = {
     config.name: config
     for config in (
-        ExtractorConfig(
-            name="efficientnet-lite0-vlad",
-            backbone="efficientnet-lite0",
-            implementation="efficientnet_lite0:EfficientNetLite0",
-            width=112,
-            parameters=5_000_000,
-            preprocessing="square224",
-            aggregator="vlad",
-            shipped_vocabulary="efficientnet-lite0.npy",
-        ),
-        ExtractorConfig(
+        _EFFICIENTNET,
+        replace(
+            _EFFICIENTNET,
             name="efficientnet-lite0-vlad128",
-            backbone="efficientnet-lite0",
-            implementation="efficientnet_lite0:EfficientNetLite0",
-            width=112,
-            parameters=5_000_000,
             preprocessing=AREA_PREPROCESSING_NAME,
-            aggregator="vlad",
             clusters=128,
             shipped_vocabulary="efficientnet-lite0-128.npy",
         ),
@@ -191,29 +198,9 @@ EXTRACTOR_CONFIGS = {
             width=64 * 32,
             parameters=0,
             preprocessing="resize32x64",
-            aggregator="none",
         ),
-        ExtractorConfig(
-            name="test-tiny-avg",
-            backbone="test-tiny",
-            implementation="synthetic:TinyBackbone",
-            width=16,
-            parameters=1_000,
-            preprocessing="square32",
-            aggregator="avg",
-            for_tests=True,
-        ),
-        ExtractorConfig(
-            name="test-tiny-vlad",
-            backbone="test-tiny",
-            implementation="synthetic:TinyBackbone",
-            width=16,
-            parameters=1_000,
-            preprocessing="square32",
-            aggregator="vlad",
-            clusters=8,
-            for_tests=True,
-        ),
+        _TINY,
+        replace(_TINY, name="test-tiny-vlad", aggregator="vlad", clusters=8),
         ExtractorConfig(
             name="test-slow-avg",
             backbone=SLOW_TEST_BACKBONE,
@@ -286,10 +273,7 @@ def _torchhub_config(hub: TorchHubEntry) -> ExtractorConfig:
         name=hub.name,
         backbone="torchhub",
         implementation="torchhub:TorchHubBackbone",
-        width=None,
-        parameters=None,
         preprocessing=hub.input.preprocessing,
-        aggregator="none",
         hub=hub,
     )
 
@@ -300,10 +284,7 @@ def _exported_config(name: str) -> ExtractorConfig:
         name=model.extractor,
         backbone=model.prefix.removesuffix(":"),
         implementation="exported:ExportedBackbone",
-        width=None,
-        parameters=None,
         preprocessing=network_input.preprocessing,
-        aggregator="none",
         model=model,
         input=network_input,
     )
@@ -328,10 +309,6 @@ def _trained_config(model: ModelName) -> ExtractorConfig:
         name=model.extractor,
         backbone="gsv",
         implementation="trained:TrainedBackbone",
-        width=None,
-        parameters=None,
-        preprocessing=None,
-        aggregator="none",
         model=model,
     )
 

@@ -23,7 +23,7 @@ from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.base import db_now
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation, GenerationState, lock_generation
-from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState, Priority
+from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState
 from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.photos import Photo, get_live_photos
 from shared.catalog.vocabularies import Vocabulary
@@ -320,12 +320,4 @@ def _queue_photo(session: Session, photo: Photo) -> None:
         requeue_job_as_new(job)
         return
     photo.job_id = new_id()
-    session.add(
-        Job(
-            id=photo.job_id,
-            map_id=photo.map_id,
-            kind=JobKind.INDEX,
-            priority=Priority.UPLOAD,
-            photo_id=photo.id,
-        )
-    )
+    session.add(Job(id=photo.job_id, map_id=photo.map_id, kind=JobKind.INDEX, photo_id=photo.id))

@@ -19,7 +19,7 @@ from uuid import UUID
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from shared.catalog.database.base import db_now
+from shared.catalog.database.base import db_now, insert_row
 from shared.catalog.generations import (
     Generation,
     GenerationState,
@@ -31,13 +31,11 @@ from shared.catalog.jobs import (
     UNFINISHED_STATES,
     Job,
     JobKind,
-    Priority,
     WaitingFor,
 )
 from shared.catalog.maps import Matching, increment_map_version, lock_map
 from shared.catalog.photos import PhotoRole, count_live_photos
 from shared.errors import Conflict
-from shared.ids import new_id
 from shared.jobs.transitions import cancel_job, cancel_jobs, requeue_job
 
 
@@ -61,13 +59,7 @@ def start_model_change(
             f"Wait for it, or cancel it: POST /api/v1/jobs/{running.id}/cancel.",
             job_id=str(running.id),
         )
-    job = Job(
-        id=new_id(),
-        map_id=map_id,
-        kind=kind,
-        priority=Priority.MODEL_CHANGE,
-        params=params,
-    )
+    job = Job(map_id=map_id, kind=kind, params=params)
     session.add(job)
     if kind == JobKind.FIT:
         map_.fitted_photos = count_live_photos(session, map_id, PhotoRole.DATABASE)
@@ -105,7 +97,6 @@ def create_generation(session: Session, job: Job, **columns: Any) -> Generation:
     first = active is None
     is_decided = active and active.uses_matches is False and map_.matching == Matching.AUTO
     generation = Generation(
-        id=new_id(),
         map_id=job.map_id,
         state=GenerationState.ACTIVE if first else GenerationState.BUILDING,
         activated_at=db_now() if first else None,
@@ -114,8 +105,7 @@ def create_generation(session: Session, job: Job, **columns: Any) -> Generation:
         uses_matches=False if is_decided else None,
         **columns,
     )
-    session.add(generation)
-    session.flush()
+    insert_row(session, generation)
     if first:
         map_.extractor = generation.extractor
         increment_map_version(session, job.map_id)

@@ -47,6 +47,7 @@ from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.catalog.webhooks import Delivery, Webhook
 from shared.errors import NotFound, Unavailable
 from shared.storage import ObjectStore
+from shared.storage.protocol import writing
 from shared.storage.segments import Segment, segment_key
 
 log = logging.getLogger(__name__)
@@ -149,15 +150,11 @@ def columns_of(line: Line) -> dict[str, Any]:
 def put_lines(store: ObjectStore, key: str, lines: Iterable[Line]) -> None:
     """Write a segment or a snapshot."""
     compressor = zlib.compressobj(GZIP_LEVEL, wbits=GZIP_WBITS)
-    writer = store.writer(key)
-    try:
+    with writing(store, key) as writer:
         writer.write(compressor.compress(json.dumps({"placewise_journal": FORMAT}).encode()))
         for line in lines:
             writer.write(compressor.compress(f"\n{line.encode()}".encode()))
         writer.write(compressor.flush())
-        writer.commit()
-    finally:
-        writer.abort()
 
 
 def read_lines(store: ObjectStore, key: str) -> Iterator[Line]:

@@ -134,11 +134,8 @@ class SearchStatus(_Message):
 MAX_MATCHED_PHOTOS = 50  # of a query
 
 
-class FeatureReference(_Message):
+class FeatureReference(RowReference):
     """Reference to the local features of a photo: row `row` of the feature file `object_key`."""
-
-    object_key: str
-    row: int = Field(ge=0)
 
 
 class MatchRequest(_Message):

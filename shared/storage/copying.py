@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from shared.config.private_files import create_private_file
-from shared.storage.protocol import ObjectStore
+from shared.storage.protocol import ObjectStore, writing
 
 COPY_BYTES = 1024 * 1024
 PARTIAL_SUFFIX = ".partial"
@@ -36,14 +36,8 @@ def hash_file(file: BinaryIO) -> tuple[int, str]:
 
 def copy_object(source: ObjectStore, target: ObjectStore, key: str) -> tuple[int, str]:
     """Copy an object; return its size in bytes and SHA-256. NotFound when it is missing."""
-    with source.open(key) as file:
-        writer = target.writer(key)
-        try:
-            copied = _copy_and_hash(file, writer.write)
-            writer.commit()
-        finally:
-            writer.abort()
-    return copied
+    with source.open(key) as file, writing(target, key) as writer:
+        return _copy_and_hash(file, writer.write)
 
 
 def hash_object(store: ObjectStore, key: str) -> tuple[int, str]:

@@ -29,7 +29,7 @@ from shared.storage.keys import (
     is_valid_key,
     object_not_found_error,
 )
-from shared.storage.protocol import ObjectInfo
+from shared.storage.protocol import ObjectInfo, writing
 
 log = logging.getLogger(__name__)
 
@@ -81,12 +81,8 @@ class FolderStore:
         )
 
     def put(self, key: str, data: bytes) -> None:
-        writer = self.writer(key)
-        try:
+        with writing(self, key) as writer:
             writer.write(data)
-            writer.commit()
-        finally:
-            writer.abort()
 
     def get(self, key: str) -> bytes:
         with self.open(key) as file:
@@ -231,13 +227,8 @@ class FolderStore:
         return deleted
 
     def _copy(self, path: Path, key: str) -> None:
-        writer = self.writer(key)
-        try:
-            with path.open("rb") as file:
-                shutil.copyfileobj(file, writer)
-            writer.commit()
-        finally:
-            writer.abort()
+        with writing(self, key) as writer, path.open("rb") as file:
+            shutil.copyfileobj(file, writer)
 
     def _list_folder(self, folder: Path, base_key: str, prefix: str) -> Iterator[ObjectInfo]:
         """Iterate over the objects of one folder, whose keys begin with `base_key`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
@@ -111,6 +112,17 @@ class OwnedStore(ObjectStore, Protocol):
 
     def delete_note(self, name: str) -> None:
         """Delete the note; a missing one is not an error."""
+
+
+@contextlib.contextmanager
+def writing(store: ObjectStore, key: str) -> Iterator[ObjectWriter]:
+    """Write an object in the block, at whose end it exists; if the block raises, it does not."""
+    writer = store.writer(key)
+    try:
+        yield writer
+        writer.commit()
+    finally:
+        writer.abort()
 
 
 def read_up_to(file: BinaryIO, size: int) -> bytes:

@@ -14,9 +14,10 @@ from typing import Annotated, Any
 
 import typer
 
+from services.cli.client import MapOptions
 from services.cli.environment import require_packages
 from services.cli.evaluate import SampleOption, SeedOption, evaluate_map
-from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption
+from services.cli.output import JsonOption, MapOption
 from shared.errors import InvalidRequest
 from shared.tracks.motion import parse_motion
 
@@ -65,6 +66,7 @@ class ReportOptions:
 
 
 def evaluate(
+    common: MapOptions,
     data: Annotated[
         Path | None,
         _existing_folder(
@@ -176,10 +178,6 @@ def evaluate(
     ] = False,
     sample: SampleOption = None,
     seed: SeedOption = None,
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Measure retrieval recall in a live map or on a data set.
 
@@ -187,7 +185,7 @@ def evaluate(
     labelled queries. With --data, evaluate a --checkpoint, an --extractor or --rows on a data set.
     With --predictions, evaluate a file of predictions.
     """
-    map_options: OptionValues = {"--sample": sample, "--seed": seed, "--map": map_name}
+    map_options: OptionValues = {"--sample": sample, "--seed": seed, "--map": common.map_name}
     model_options: OptionValues = {
         "--checkpoint": checkpoint, "--extractor": extractor, "--vocabulary": vocabulary,
         "--fit-vocabulary": fit_vocabulary, "--protocol": protocol, "--rule": rule, "--rows": rows,
@@ -201,7 +199,7 @@ def evaluate(
     }  # fmt: skip
     report_options = ReportOptions(
         out, against, pairs, depth, _parse_recall_at(recall_at, depth), grids, only_wrong,
-        faiss_gpu, place_labels_are_paths, as_json,
+        faiss_gpu, place_labels_are_paths, common.as_json,
     )  # fmt: skip
     if predictions is not None:
         rules: OptionValues = {"--protocol": protocol, "--rule": rule}
@@ -248,12 +246,12 @@ def evaluate(
             }  # fmt: skip
             _reject_options("with --sequences", unused)
             speeds = parse_motion(motion)
-            evaluate_sequences(data, sets, protocol, rule, target, speeds, as_json)
+            evaluate_sequences(data, sets, protocol, rule, target, speeds, common.as_json)
             return
         evaluate_sets(data, sets, protocol, rule, ground_truth, target, report_options)
         return
     _reject_options("without --data", model_options | file_options | output_options)
-    evaluate_map(sample, seed, map_name, server, key, as_json)
+    evaluate_map(common, sample, seed)
 
 
 def _reject_options(context: str, options: OptionValues) -> None:

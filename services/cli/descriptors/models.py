@@ -15,19 +15,16 @@ from rich.markup import escape
 from rich.table import Column
 
 from placewise.protocol import printable_name
-from services.cli.client import connect, wait_for_job
+from services.cli.client import MapOptions, ServerOptions, wait_for_job
 from services.cli.descriptors.local_weights import inspect_weights, list_extractor_configs
 from services.cli.environment import read_settings
+from services.cli.option_groups import CommandGroup
 from services.cli.output import (
     JsonOption,
-    KeyOption,
-    MapOption,
-    ServerOption,
     Table,
     print_json,
     print_message,
     print_result,
-    print_table,
     progress_bar,
 )
 from shared.errors import Misconfigured
@@ -35,11 +32,12 @@ from shared.extractor_config.configs import get_extractor_config
 
 EXPORTED_NETWORK = {"backbone_arch": "exported", "agg_arch": ""}  # nothing else is known of it
 
-app = typer.Typer(help="Manage extractor weights and trained models.")
+app = CommandGroup(help="Manage extractor weights and trained models.")
 
 
 @app.command("add")
 def add(
+    common: MapOptions,
     checkpoint: Annotated[
         Path,
         typer.Argument(
@@ -52,7 +50,6 @@ def add(
     name: Annotated[
         str,
         typer.Option(
-            "--name",
             metavar="NAME",
             help="Permanent name; maps refer to it as gsv:NAME, torchscript:NAME or onnx:NAME.",
         ),
@@ -60,26 +57,19 @@ def add(
     options: Annotated[
         str | None,
         typer.Option(
-            "--options",
             help="TorchScript or ONNX file: what its network expects, and the aggregator, as in "
             "input.size=288x288,aggregator=vlad.",
         ),
     ] = None,
-    licence: Annotated[
-        str | None, typer.Option("--licence", help="Licence of the weights.")
-    ] = None,
-    note: Annotated[str | None, typer.Option("--note", help="Free-text note.")] = None,
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
+    licence: Annotated[str | None, typer.Option(help="Licence of the weights.")] = None,
+    note: Annotated[str | None, typer.Option(help="Free-text note.")] = None,
 ) -> None:
     """Upload a checkpoint, TorchScript or ONNX file as an extractor for maps.
 
     The server's extractor validates the file and stores only what is needed to describe photos.
     `--map` only selects the map whose job list shows the job.
     """
-    with connect(server, map_name, key) as client, progress_bar() as progress:
+    with common.connect() as client, progress_bar() as progress:
         client.models()  # fails before the upload if the URL or key is wrong
         with progress.open(checkpoint, "rb", description="uploading (bytes)") as file:
             started = client.add_model(
@@ -94,7 +84,7 @@ def add(
     model = job.result or {}
     print_result(
         job,
-        as_json,
+        common.as_json,
         f"{model['extractor']}: {model['dimension']} dimensions, "
         f"{model['size_bytes'] / 1e6:.1f} MB, fingerprint {model['fingerprint'][:12]}"
         f"{'; already stored' if model['already_there'] else ''}.",
@@ -102,15 +92,10 @@ def add(
 
 
 @app.command("added")
-def list_added(
-    server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False
-) -> None:
+def list_added(common: ServerOptions) -> None:
     """List added models and the maps that use them."""
-    with connect(server, None, key) as client:
+    with common.connect() as client:
         models = client.models()
-    if as_json:
-        print_json(models)
-        return
     name = Column("extractor", overflow="fold", min_width=12)
     table = Table(name, "network", "image", "dimension", "size", "licence", "maps", "note")
     for model in models:
@@ -124,22 +109,20 @@ def list_added(
             escape(", ".join(model.maps)),
             escape(model.note or ""),
         )
-    print_table(table)
+    print_result(models, common.as_json, table)
 
 
 @app.command("remove")
 def remove(
+    common: ServerOptions,
     name: Annotated[
         str, typer.Argument(metavar="NAME", help="Name of an added model; see `models added`.")
     ],
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Remove a model that no map uses. Its name can't be reused for other weights."""
-    with connect(server, None, key) as client:
+    with common.connect() as client:
         removed = client.remove_model(name)
-    print_result(removed, as_json, removed.message)
+    print_result(removed, common.as_json, removed.message)
 
 
 @app.command("list")
@@ -147,9 +130,6 @@ def list_(as_json: JsonOption = False) -> None:
     """List extractors and their weights on this machine."""
     settings = read_settings()
     all_weights = [inspect_weights(config, settings) for config in list_extractor_configs(settings)]
-    if as_json:
-        print_json([asdict(weights) for weights in all_weights])
-        return
     name = Column("extractor", overflow="fold", min_width=23)
     table = Table(name, "available", "size", "source", "licence")
     for weights in all_weights:
@@ -160,7 +140,7 @@ def list_(as_json: JsonOption = False) -> None:
             escape(weights.source),
             escape(weights.licence),
         )
-    print_table(table)
+    print_result([asdict(weights) for weights in all_weights], as_json, table)
 
 
 @app.command("fetch")

@@ -12,29 +12,25 @@ from rich.table import Column
 
 from placewise.answers import Generation, Job
 from placewise.protocol import drop_none
-from services.cli.client import active_generation, connect, wait_for_job
+from services.cli.client import MapOptions, active_generation, wait_for_job
+from services.cli.option_groups import CommandGroup
 from services.cli.output import (
     Json,
-    JsonOption,
-    KeyOption,
-    MapOption,
-    ServerOption,
     Table,
     atomic_write,
-    print_json,
     print_result,
-    print_table,
     printable_path,
     progress_bar,
 )
 from shared.errors import InvalidRequest
 from shared.extractor_config.configs import DEFAULT_SAMPLE_PHOTOS, MAX_CLUSTERS
 
-app = typer.Typer(help="Manage VLAD vocabularies (cluster centres): fit, import, export, list.")
+app = CommandGroup(help="Manage VLAD vocabularies (cluster centres): fit, import, export, list.")
 
 
 @app.command("fit")
 def fit(
+    common: MapOptions,
     clusters: Annotated[
         int | None,
         typer.Option(
@@ -48,20 +44,17 @@ def fit(
         ),
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, max=2**31 - 1, help="Random seed.")] = None,
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Fit a vocabulary on the map's photos, reindex them, and switch to the result."""
     parameters = drop_none(clusters=clusters, sample=sample, seed=seed)
-    with connect(server, map_name, key) as client, progress_bar() as progress:
+    with common.connect() as client, progress_bar() as progress:
         job = wait_for_job(client, client.fit_vocabulary(**parameters), progress, "vocabulary")
-    _print_generation(job, as_json)
+    _print_generation(job, common.as_json)
 
 
 @app.command("import")
 def import_(
+    common: MapOptions,
     file: Annotated[
         Path,
         typer.Argument(
@@ -70,10 +63,6 @@ def import_(
             help=".npz of `vocabulary export`, .npy, or AnyLoc's c_centers.pt",
         ),
     ],
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Import a vocabulary, reindex the map with it, and switch to the result."""
     from shared.descriptors.vocabulary_file import read_vocabulary  # imports torch
@@ -81,31 +70,28 @@ def import_(
     vocabulary = read_vocabulary(file)
     with (
         tempfile.TemporaryDirectory() as folder,
-        connect(server, map_name, key) as client,
+        common.connect() as client,
         progress_bar() as progress,
     ):
         normalised_file = Path(folder, f"{file.stem}{vocabulary.suffix}")
         normalised_file.write_bytes(vocabulary.encode())
         started = client.import_vocabulary(normalised_file)
         job = wait_for_job(client, started, progress, "vocabulary")
-    _print_generation(job, as_json)
+    _print_generation(job, common.as_json)
 
 
 @app.command("export")
 def export(
+    common: MapOptions,
     vocabulary_id: Annotated[
         UUID, typer.Argument(metavar="ID", help="Vocabulary ID; see `vocabulary list`.")
     ],
     out: Annotated[
-        Path, typer.Option("--out", metavar="FILE.npz", help="Output file, accepted by `import`.")
+        Path, typer.Option(metavar="FILE.npz", help="Output file, accepted by `import`.")
     ],
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Write a vocabulary of the map to a file: .npz, or .npy if its provenance is unknown."""
-    with connect(server, map_name, key) as client:
+    with common.connect() as client:
         data = client.vocabulary_file(vocabulary_id)
     suffix = ".npz" if data.startswith(b"PK") else ".npy"
     if out.suffix != suffix:
@@ -117,26 +103,18 @@ def export(
         file.write(data)
     print_result(
         {"file": printable_path(out), "vocabulary_id": str(vocabulary_id), "bytes": len(data)},
-        as_json,
+        common.as_json,
         f"{printable_path(out)}: {len(data)} bytes.",
     )
 
 
 @app.command("list")
-def list_(
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
-) -> None:
+def list_(common: MapOptions) -> None:
     """List the map's vocabularies, newest first. The active one is marked."""
-    with connect(server, map_name, key) as client:
+    with common.connect() as client:
         vocabularies = client.vocabularies()
         active = active_generation(client)
     active_id = active and active.vocabulary_id
-    if as_json:
-        print_json([{**v.as_json(), "active": v.vocabulary_id == active_id} for v in vocabularies])
-        return
     # IDs are folded, not truncated, so that they can be copied.
     name = Column("vocabulary", overflow="fold", min_width=36)
     table = Table("active", name, "origin", "clusters", "dimension", "photos", "created")
@@ -152,7 +130,8 @@ def list_(
             str(v.provenance.get("photos", "")),
             f"{v.created_at:%Y-%m-%d %H:%M:%S}",
         )
-    print_table(table)
+    listed = [{**v.as_json(), "active": v.vocabulary_id == active_id} for v in vocabularies]
+    print_result(listed, common.as_json, table)
 
 
 def _format_provenance(provenance: Json) -> str:

@@ -8,48 +8,32 @@ from typing import Annotated
 
 import typer
 
-from services.cli.client import connect, describe_target
+from services.cli.client import MapOptions
 from services.cli.environment import read_settings
 from services.cli.immich.api import ImmichApi
 from services.cli.immich.library import ImmichLibrary
 from services.cli.immich.sync import sync_map
-from services.cli.locate.command import (
-    AcceptOption,
-    ClockOffsetOption,
-    GpxOption,
-    MotionOption,
-    PictureOption,
-    RadiusOption,
-    TogetherOption,
-)
 from services.cli.locate.proposals import LocateOptions, locate_library, report_undo
 from services.cli.output import (
     Json,
-    JsonOption,
-    KeyOption,
-    MapOption,
-    ServerOption,
-    TimeZoneOption,
     first_names,
     print_failures,
     print_note,
     printable_text,
     progress_bar,
 )
-from shared.config.command_line import command_line
 from shared.errors import Misconfigured
 
 KEY_VARIABLE = "IMMICH_API_KEY"
 
 
 def immich(
+    options: LocateOptions,
+    common: MapOptions,
     url: Annotated[
         str,
         typer.Option(envvar="IMMICH_URL", help="Address of Immich, such as http://immich:2283."),
     ],
-    gpx: GpxOption = None,
-    accept: AcceptOption = 0.95,
-    radius: RadiusOption = 100.0,
     write: Annotated[
         bool,
         typer.Option(
@@ -60,15 +44,6 @@ def immich(
     undo_changes: Annotated[
         bool, typer.Option("--undo", help="Take back what --write has written into Immich.")
     ] = False,
-    motion: MotionOption = "walk",
-    together: TogetherOption = False,
-    time_zone: TimeZoneOption = None,
-    clock_offset: ClockOffsetOption = 0.0,
-    picture: PictureOption = True,
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Index the photos of Immich that have coordinates, and propose places for the others.
 
@@ -86,7 +61,7 @@ def immich(
     with contextlib.ExitStack() as stack:
         api = stack.enter_context(contextlib.closing(ImmichApi(url, immich_key)))
         journals = read_settings().placewise_home / "immich"
-        library = ImmichLibrary(api, journals, time_zone, clock_offset)
+        library = ImmichLibrary(api, journals, options.time_zone, options.clock_offset)
         if undo_changes:
             undone = library.undo()
             message = f"{len(undone.restored)} photos have the coordinates of before again."
@@ -96,24 +71,25 @@ def immich(
                     "away, so they have 0, 0 now, which Placewise takes for no place: "
                     f"{printable_text(first_names(undone.removed))}"
                 )
-            report_undo(undone, message, as_json)
+            report_undo(undone, message, common.as_json)
             return
-        client = stack.enter_context(connect(server, map_name, key))
+        client = stack.enter_context(common.connect())
         print_note(
-            f"Indexing Immich {api.version()} at {api.url} into "
-            f"{describe_target(client, server, map_name)}"
+            f"Indexing Immich {api.version()} at {api.url} into {common.describe_target(client)}"
         )
         photos = library.list_photos()
         with progress_bar() as progress:
             indexed = sync_map(client, library, photos, progress)
-        if not as_json:
+        if not common.as_json:
             _print_indexed(indexed)
-        options = LocateOptions(
-            accept, radius, motion, together, gpx, picture, server, map_name, write, as_json,
-            command_line("immich", "--url", url, "--undo"), "photos",
-        )  # fmt: skip
         complete = locate_library(
-            library, options, lambda: contextlib.nullcontext(client), photos, indexed=indexed
+            library,
+            options,
+            common,
+            lambda: contextlib.nullcontext(client),
+            photos,
+            write=write,
+            indexed=indexed,
         )
     if indexed["failed"] or not complete:
         raise typer.Exit(1)

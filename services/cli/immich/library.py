@@ -18,6 +18,7 @@ from services.cli.immich.api import Coordinates, ImmichApi
 from services.cli.locate.folder import set_clocks
 from services.cli.locate.library import LibraryPhoto, LocatedPhoto, UndoReport, WriteReport
 from services.cli.output import Json, printable_path
+from shared.config.command_line import command_line
 from shared.config.private_files import make_private_folder
 from shared.errors import (
     Conflict,
@@ -53,6 +54,8 @@ class ImmichLibrary:
         folder: Where the journal is kept.
     """
 
+    written_are = "photos"
+
     def __init__(
         self,
         api: ImmichApi,
@@ -69,6 +72,11 @@ class ImmichLibrary:
     def identity(self) -> str:
         """The user, whatever the address of the server is."""
         return f"immich:{self._user_id}"
+
+    @property
+    def undo_command(self) -> str:
+        """That of `placewise immich`."""
+        return command_line("immich", "--url", self._api.url, "--undo")
 
     def list_photos(self) -> Sequence[LibraryPhoto]:
         """List the images; their names begin with that of an album that they are in."""

@@ -15,7 +15,7 @@ import typer
 from placewise.answers import BatchStarted
 from placewise.client import Client
 from placewise.protocol import open_file
-from services.cli.client import client_command, connect, describe_target
+from services.cli.client import MapOptions
 from services.cli.ingest.anyloc import read_anyloc_photos
 from services.cli.ingest.geotags import (
     LocalPhoto,
@@ -30,16 +30,11 @@ from services.cli.ingest.upload import (
     NoFitOption,
     UpdateOption,
     manifest_has_keys,
-    switch_off_fits,
     upload_photos,
     wait_for_batch,
 )
 from services.cli.output import (
     Json,
-    JsonOption,
-    KeyOption,
-    MapOption,
-    ServerOption,
     TimeZoneOption,
     print_failures,
     print_json,
@@ -55,6 +50,7 @@ MAX_LISTED_SUFFIXES = 5
 
 
 def index(
+    common: MapOptions,
     sources: Annotated[
         list[str],
         typer.Argument(
@@ -100,10 +96,6 @@ def index(
     ] = PhotoRole.DATABASE,
     update: UpdateOption = False,
     no_fit: NoFitOption = False,
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Upload photos and wait until they are searchable.
 
@@ -186,20 +178,20 @@ def index(
                 "sidecars": len(sidecars),
                 **asdict(headers),
             }
-        client = stack.enter_context(connect(server, map_name, key))
+        client = stack.enter_context(common.connect())
         progress = stack.enter_context(progress_bar())
-        print_note(f"Indexing into {describe_target(client, server, map_name)}")
+        print_note(f"Indexing into {common.describe_target(client)}")
         if no_fit:
-            switch_off_fits(client)
+            client.update_map(client.stats().map, auto_fit=False)
         if batch is not None:
             report = wait_for_batch(client, batch(client), progress)
         else:
             report = upload_photos(client, photos, progress, update=update)
     report |= about_sources
-    if as_json:
+    if common.as_json:
         print_json(report)
     else:
-        _print_report(report, server, map_name, role)
+        _print_report(report, common, role)
     if report["refused"] or report["failed"] or report.get("missing"):
         raise typer.Exit(1)
 
@@ -224,7 +216,7 @@ def _list_suffixes(report: Json) -> str:
     return f" ({', '.join(shown)})" if kinds else ""
 
 
-def _print_report(report: Json, server: str | None, map_name: str | None, role: PhotoRole) -> None:
+def _print_report(report: Json, common: MapOptions, role: PhotoRole) -> None:
     print_note(
         f"{report['photos']} photos processed, {report['already_there']} already stored. "
         f"The map now has {report['searchable']} searchable photos "
@@ -258,7 +250,7 @@ def _print_report(report: Json, server: str | None, map_name: str | None, role: 
             print_note(f"{printable_text(item['path'])}: {item['reason']}")
     print_failures(report, "refused", "failed")
     command = ("query", "PHOTO") if role == PhotoRole.DATABASE else ("evaluate",)
-    print_note(f"Next: {client_command(*command, server=server, map_name=map_name)}")
+    print_note(f"Next: {common.command_line(*command)}")
 
 
 def _count(number: int, noun: str) -> str:

@@ -116,11 +116,6 @@ def upload_photos(
     }
 
 
-def switch_off_fits(client: Client) -> None:
-    """Switch automatic vocabulary fits off for the client's map."""
-    client.update_map(client.stats().map, auto_fit=False)
-
-
 def wait_for_automatic_fit(client: Client, progress: Progress) -> Job | None:
     """Wait for the vocabulary fit that runs, or that is due and that the server is about to start.
 

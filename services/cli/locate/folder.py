@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import ClassVar
 from xml.etree import ElementTree
 
 from services.cli.ingest.geotags import list_photos
@@ -28,6 +29,7 @@ from services.cli.locate.sidecars import (
     sidecar_path,
 )
 from services.cli.output import printable_path, refuse_unwritable, utf8_path
+from shared.config.command_line import command_line
 from shared.errors import InvalidRequest, NotFound, PlacewiseError
 from shared.geotagging.evidence import KnownPosition, add_time_zones
 from shared.geotagging.fusion import Proposal
@@ -42,11 +44,17 @@ class FolderLibrary:
     folder: Path
     time_zone: str | None = None
     clock_offset_seconds: float = 0.0
+    written_are: ClassVar[str] = "files"
 
     @property
     def identity(self) -> str:
         """The absolute path."""
         return str(self.folder.resolve())
+
+    @property
+    def undo_command(self) -> str:
+        """That of `placewise locate`."""
+        return command_line("locate", self.folder, "--undo")
 
     def list_photos(self) -> Sequence[LibraryPhoto]:
         """Raises InvalidRequest: `no_photos`, `bad_time_zone`."""

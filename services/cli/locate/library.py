@@ -88,6 +88,14 @@ class PhotoLibrary(Protocol):
     def identity(self) -> str:
         """What tells the library from others on this machine."""
 
+    @property
+    def written_are(self) -> str:
+        """What is written, in the plural, such as files."""
+
+    @property
+    def undo_command(self) -> str:
+        """The command line that undoes what is written."""
+
     def list_photos(self) -> Sequence[LibraryPhoto]:
         """List all photos, with and without coordinates, with unique names."""
 

@@ -9,12 +9,14 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import typer
 from rich.markup import escape
 from rich.table import Column
 
 from placewise.client import Client
+from services.cli.client import MapOptions
 from services.cli.environment import read_settings
 from services.cli.locate.folder import check_time_zones, read_gpx
 from services.cli.locate.library import (
@@ -34,6 +36,7 @@ from services.cli.locate.preview import (
 from services.cli.output import (
     Json,
     Table,
+    TimeZoneOption,
     first_names,
     format_percent,
     print_json,
@@ -53,7 +56,7 @@ from shared.geotagging.locate import (
     probable_label,
     search_for_position,
 )
-from shared.tracks.motion import parse_motion
+from shared.tracks.motion import MOTION_MODELS, parse_motion
 
 SEARCHES_AT_ONCE = 4
 WITH_COORDINATES = "-90,-180,90,180"  # a box that contains all photos that have some
@@ -61,28 +64,54 @@ WITH_COORDINATES = "-90,-180,90,180"  # a box that contains all photos that have
 
 @dataclass(frozen=True, slots=True)
 class LocateOptions:
-    """The options that the commands share, and how they name what they write."""
+    """Options of the commands that propose positions."""
 
-    accept: float
-    radius_m: float
-    motion: str
-    together: bool
-    gpx: Path | None
-    picture: bool
-    server: str | None
-    map_name: str | None
-    write: bool
-    as_json: bool
-    undo_command: str
-    written_are: str
-    """in the plural, such as files"""
+    gpx: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="GPX track of the trip.", exists=True, dir_okay=False),
+    ] = None
+    accept: Annotated[
+        float, typer.Option(min=0, max=1, help="Probability from which a proposal is accepted.")
+    ] = 0.95
+    radius: Annotated[
+        float,
+        typer.Option(min=10, max=2000, help="Radius in metres that the probability is for."),
+    ] = 100.0
+    motion: Annotated[
+        str,
+        typer.Option(
+            help=f"How the photographer moved: {', '.join(MOTION_MODELS)}, or a maximum speed in "
+            "m/s."
+        ),
+    ] = "walk"
+    together: Annotated[
+        bool,
+        typer.Option(
+            "--together",
+            help="The people with the cameras travelled together: photos of all cameras count as "
+            "neighbours in time, not only those of the same camera.",
+        ),
+    ] = False
+    time_zone: TimeZoneOption = None
+    clock_offset: Annotated[
+        float,
+        typer.Option(
+            metavar="SECONDS", help="How far the clock of the cameras without GPS was ahead."
+        ),
+    ] = 0.0
+    picture: Annotated[
+        bool, typer.Option("--picture/--no-picture", help="Search the map with the photos.")
+    ] = True
 
 
 def locate_library(
     library: PhotoLibrary,
     options: LocateOptions,
+    common: MapOptions,
     open_client: Callable[[], AbstractContextManager[Client]],
     photos: Sequence[LibraryPhoto] | None = None,
+    *,
+    write: bool,
     **more_json: Json,
 ) -> bool:
     """Propose positions for the photos without coordinates, print, and with `write`, write them.
@@ -101,9 +130,9 @@ def locate_library(
     moves = parse_motion(options.motion)
     photos = library.list_photos() if photos is None else photos
     path = preview_file(
-        read_settings().placewise_home, library.identity, options.server, options.map_name
+        read_settings().placewise_home, library.identity, common.server, common.map_name
     )
-    preview = read_preview(path) if options.picture and options.write else None
+    preview = read_preview(path) if options.picture and write else None
     if options.together:
         check_time_zones(photos, "--together")
     unlocated = [photo for photo in photos if photo.is_unlocated]
@@ -120,15 +149,15 @@ def locate_library(
         with open_client() as client:
             searches |= _search_photos(client, library, new)
     neighbours = TimeNeighbours(photos, options.together)
-    finder = PositionFinder(neighbours, track, moves, options.radius_m)
+    finder = PositionFinder(neighbours, track, moves, options.radius)
     located = [_locate_photo(photo, searches.get(photo.name), finder) for photo in unlocated]
     accept_from = max(options.accept, 1e-9)
     accepted = [each for each in located if each.probability >= accept_from]
-    written = library.write(accepted) if options.write else None
-    if options.as_json:
+    written = library.write(accepted) if write else None
+    if common.as_json:
         print_json(_to_json(photos, located, options.accept, written) | more_json)
     else:
-        _print_proposals(options, photos, located, accepted, written)
+        _print_proposals(library, options.accept, photos, located, accepted, written)
     if preview is not None:
         _print_changes(preview, accepted)
     if new:  # at the end, so that nothing is lost if it can't be written
@@ -235,7 +264,8 @@ def _to_json(
 
 
 def _print_proposals(
-    options: LocateOptions,
+    library: PhotoLibrary,
+    accept: float,
     photos: Sequence[LibraryPhoto],
     located: Sequence[LocatedPhoto],
     accepted: Sequence[LocatedPhoto],
@@ -276,7 +306,7 @@ def _print_proposals(
     print_message(
         f"{with_coordinates} of {len(photos)} photos have coordinates; "
         f"{len(accepted)} of the {len(located)} others have a proposal with at least "
-        f"{100 * options.accept:g} %."
+        f"{100 * accept:g} %."
     )
     without_zone = sum(p.time is not None and not p.time_zone_is_known for p in photos)
     if without_zone:
@@ -290,8 +320,8 @@ def _print_proposals(
         return
     names = printable_text(first_names(written.written))
     print_note(
-        f"{len(written.written)} {options.written_are} written{': ' if names else ''}{names}. "
-        f"Undo: {options.undo_command}"
+        f"{len(written.written)} {library.written_are} written{': ' if names else ''}{names}. "
+        f"Undo: {library.undo_command}"
     )
     for name, reason in written.skipped.items():
         print_problem("skipped", name, reason)

@@ -11,8 +11,9 @@ import typer
 from rich.markup import escape
 
 from placewise.protocol import response_error
+from services.cli.client import ServerOptions
 from services.cli.environment import read_settings
-from services.cli.output import JsonOption, KeyOption, ServerOption, console, print_json
+from services.cli.output import console, print_json
 from shared.config.command_line import command_line
 from shared.config.embedded_home import RunningServer, find_running_server
 from shared.config.settings import Settings
@@ -30,7 +31,7 @@ class _CheckResult:
     detail: str
 
 
-def doctor(server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False) -> None:
+def doctor(common: ServerOptions) -> None:
     """Check this installation, and print the health of a running server.
 
     The exit code is 1 if a part needs attention. Run the command where a service runs, with that
@@ -39,24 +40,28 @@ def doctor(server: ServerOption = None, key: KeyOption = None, as_json: JsonOpti
     try:
         settings = read_settings()
     except Misconfigured as error:
-        _print_results([_CheckResult("settings", False, error.detail)], as_json)
+        _print_results([_CheckResult("settings", False, error.detail)], common.as_json)
         raise typer.Exit(1) from None
     # Imported here: the help does not need a database.
     from services.cli.operations.installation_checks import list_checks
 
-    running = RunningServer(server) if server else find_running_server(settings.placewise_home)
+    running = (
+        RunningServer(common.server)
+        if common.server
+        else find_running_server(settings.placewise_home)
+    )
     results = [
         _run_check(part, check, settings)
         for part, check in list_checks(settings, has_server=running is not None)
     ]
     if running is not None:
-        results += _read_health(running.url, key or running.key)
+        results += _read_health(running.url, common.key or running.key)
     elif settings.database_url is not None:
         results.append(_CheckResult("server", True, "not checked: name the gateway, --server URL"))
     else:
         start = command_line("serve", home=settings.placewise_home)
         results.append(_CheckResult("server", True, f"not running. Start it: {start}"))
-    _print_results(results, as_json)
+    _print_results(results, common.as_json)
     if not all(result.ok for result in results):
         raise typer.Exit(1)
 

@@ -9,28 +9,22 @@ from uuid import UUID
 import typer
 
 from placewise.answers import Key
-from services.cli.client import connect
-from services.cli.output import (
-    JsonOption,
-    KeyOption,
-    ServerOption,
-    Table,
-    print_json,
-    print_result,
-    print_table,
-)
+from services.cli.client import ServerOptions
+from services.cli.option_groups import CommandGroup
+from services.cli.output import Table, print_json, print_result
 from shared.errors import Conflict, NotFound
 from shared.security.api_keys import Scope
 
-app = typer.Typer(help="Manage API keys: their scopes, limits and expiry.")
+app = CommandGroup(help="Manage API keys: their scopes, limits and expiry.")
 
 
 @app.command("create")
 def create(
+    common: ServerOptions,
     name: Annotated[
         str, typer.Argument(metavar="NAME", help="Name of the key: its owner or purpose.")
     ],
-    scope: Annotated[list[Scope], typer.Option("--scope", help="Scope to grant. Can be repeated.")],
+    scope: Annotated[list[Scope], typer.Option(help="Scope to grant. Can be repeated.")],
     maps: Annotated[
         list[str] | None,
         typer.Option("--map", help="Only map that the key may use. Can be repeated. Default: all."),
@@ -45,9 +39,6 @@ def create(
     max_photos: Annotated[
         int | None, typer.Option(min=1, max=2**53, help="Maximum number of stored photos.")
     ] = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Create a key and print it. It can't be shown again.
 
@@ -57,11 +48,11 @@ def create(
         "requests_per_minute": requests_per_minute,
         "max_photos": max_photos,
     }
-    with connect(server, None, key) as client:
+    with common.connect() as client:
         if maps:
             _check_maps(maps, [each.name for each in client.maps()])
         created = client.create_key(name, list(scope), days=days, maps=maps or None, **limits)
-    if as_json:
+    if common.as_json:
         print_json(created)
         return
     # The key alone goes to stdout, so that it can be redirected to a file.
@@ -70,13 +61,10 @@ def create(
 
 
 @app.command("list")
-def list_(server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False) -> None:
+def list_(common: ServerOptions) -> None:
     """List all keys, including revoked and expired ones, without their secrets."""
-    with connect(server, None, key) as client:
+    with common.connect() as client:
         listed = client.keys()
-    if as_json:
-        print_json(listed)
-        return
     table = Table("key", "name", "scopes", "maps", "created", "last used", "state")
     for item in listed:
         table.add_row(
@@ -88,20 +76,18 @@ def list_(server: ServerOption = None, key: KeyOption = None, as_json: JsonOptio
             f"{item.last_used_at:%Y-%m-%dT%H:%M}" if item.last_used_at else "never",
             _key_status(item),
         )
-    print_table(table)
+    print_result(listed, common.as_json, table)
 
 
 @app.command("revoke")
 def revoke(
+    common: ServerOptions,
     which: Annotated[str, typer.Argument(metavar="KEY", help="The key's ID or displayed prefix.")],
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Revoke a key with immediate effect."""
-    with connect(server, None, key) as client:
+    with common.connect() as client:
         revoked = client.revoke_key(_resolve_key_id(which, client.keys()))
-    print_result(revoked, as_json, f"Revoked key {revoked.prefix}... ({revoked.name}).")
+    print_result(revoked, common.as_json, f"Revoked key {revoked.prefix}... ({revoked.name}).")
 
 
 def _check_maps(names: Sequence[str], existing: Collection[str]) -> None:

@@ -101,16 +101,8 @@ def _report_as_json(report: IntegrityReport, queued: int | None) -> dict[str, An
         {name: str(value) for name, value in asdict(fault).items() if value is not None}
         for fault in report.faults
     ]
-    return {
-        "checked": dict(report.checked),
-        "read_bytes": report.read_bytes,
-        "faults": faults,
-        "orphans": report.orphans,
-        "orphan_bytes": report.orphan_bytes,
-        "trash_objects": report.trash_objects,
-        "trash_bytes": report.trash_bytes,
-        "queued_photos": queued,
-    }
+    checked = dict(report.checked)
+    return {**asdict(report), "checked": checked, "faults": faults, "queued_photos": queued}
 
 
 def _print_report(report: IntegrityReport, queued: int | None) -> None:
@@ -228,9 +220,7 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
 def restore_trash(
     prefix: Annotated[
         str,
-        typer.Option(
-            "--prefix", help="Only objects whose key starts with this prefix, such as originals/."
-        ),
+        typer.Option(help="Only objects whose key starts with this prefix, such as originals/."),
     ] = "",
     as_json: JsonOption = False,
 ) -> None:

@@ -17,7 +17,7 @@ from services.cli.recovery.journal_rows import ROWS_PER_STATEMENT, Progress, Rec
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.database.session import Catalog
-from shared.catalog.generations import Generation, GenerationState, RowType
+from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import get_or_create_default_map, increment_map_version
 from shared.catalog.photos import Photo
 from shared.config.settings import Settings
@@ -172,9 +172,8 @@ def _store(
         )
         if session.scalar(same.limit(1)) is not None:
             return False  # an unacknowledged second upload of the same bytes
-        map_ = get_or_create_default_map(
-            session, settings.new_map_extractor, RowType(settings.descriptor_rows)
-        )
+        extractor, row_type = settings.new_map_extractor, settings.descriptor_rows
+        map_ = get_or_create_default_map(session, extractor, row_type)
         photo = insert_photo(session, map_.id, incoming).photo
         session.execute(update(Photo).where(Photo.id == photo.id).values(uploaded_at=uploaded_at))
         return True

@@ -31,7 +31,7 @@ from shared.catalog.installation import (
     adopt_store,
     get_or_create_installation,
 )
-from shared.catalog.jobs import Job, JobKind, Priority
+from shared.catalog.jobs import Job, JobKind
 from shared.catalog.maps import DEFAULT_MAP, CachedMapStatistics, Map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
@@ -146,7 +146,6 @@ def _queue_photos(catalog: Catalog, progress: Progress) -> int:
                     "id": photo.job_id or new_id(),
                     "map_id": photo.map_id,
                     "kind": JobKind.INDEX,
-                    "priority": Priority.UPLOAD,
                     "photo_id": photo.id,
                 }
                 for photo in photos

@@ -17,12 +17,8 @@ from rich.table import Column
 
 from placewise.answers import OneTrack, TrackFrame
 from placewise.client import Client
-from services.cli.client import connect
+from services.cli.client import MapOptions
 from services.cli.output import (
-    JsonOption,
-    KeyOption,
-    MapOption,
-    ServerOption,
     Table,
     atomic_write,
     check_output_path,
@@ -49,12 +45,13 @@ WAIT_SECONDS = 20.0
 
 
 def track(
+    common: MapOptions,
     source: Annotated[
         Path,
         typer.Argument(metavar="SOURCE", exists=True, help="A folder of photos, or a video."),
     ],
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE.gpx", help="Write the track as GPX.")
+        Path | None, typer.Option(metavar="FILE.gpx", help="Write the track as GPX.")
     ] = None,
     motion: Annotated[
         str | None,
@@ -92,10 +89,6 @@ def track(
             help="States given all frames, or as they were known at each frame.",
         ),
     ] = True,
-    map_name: MapOption = None,
-    server: ServerOption = None,
-    key: KeyOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Follow the camera that took the photos or the video in SOURCE through a map, frame by frame.
 
@@ -107,7 +100,7 @@ def track(
         check_output_path(out, ".gpx", "a track")
     timing = FrameTiming(every, begin and begin.replace(tzinfo=UTC))
     with (
-        connect(server, map_name, key) as client,
+        common.connect() as client,
         progress_bar() as progress,
         tempfile.TemporaryDirectory() as folder,
     ):
@@ -128,7 +121,7 @@ def track(
     if out is not None:
         with atomic_write(out) as file:
             file.write(to_gpx(result))
-    if as_json:
+    if common.as_json:
         print_json(result)
     else:
         _print_track(result, out)

@@ -113,7 +113,6 @@ class BatchItemsParams(MapPageParams):
 
 @router.post(
     "/upload/batch",
-    operation_id="upload_batch",
     status_code=202,
     openapi_extra=REQUEST_BODY,
     dependencies=[WRITE, CHECK_PHOTO_QUOTA, ADMIT_JOB],

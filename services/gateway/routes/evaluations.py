@@ -11,13 +11,12 @@ from services.gateway.dependencies import GatewayDep, MapQuery, PageQuery
 from services.gateway.idempotency import IdempotentDep
 from services.gateway.responses import JobAcceptedResponse
 from shared.catalog.chunks import has_geotagged
-from shared.catalog.generations import active_generation, list_evaluations
+from shared.catalog.generations import Evaluation, active_generation
 from shared.catalog.maps import get_map
 from shared.catalog.photos import PhotoRole
 from shared.errors import Conflict
 from shared.http.request_model import RequestModel
-from shared.ids import new_id
-from shared.jobs import Job, JobKind, Priority
+from shared.jobs import Job, JobKind
 from shared.responses import ResponseModel
 from shared.responses.maps import EvaluationResponse
 
@@ -38,10 +37,8 @@ class EvaluationsResponse(ResponseModel):
     next_cursor: str | None
 
 
-@router.post(
-    "/evaluations", operation_id="evaluate", status_code=202, dependencies=[WRITE, ADMIT_JOB]
-)
-def start_evaluation(
+@router.post("/evaluations", status_code=202, dependencies=[WRITE, ADMIT_JOB])
+def evaluate(
     gateway: GatewayDep,
     idempotent: IdempotentDep,
     query: MapQuery,
@@ -62,24 +59,17 @@ def start_evaluation(
                 "The map has no described photo with coordinates or a place. Upload photos with "
                 "coordinates or places, and wait for their jobs.",
             )
-        job = Job(
-            id=new_id(),
-            map_id=map_.id,
-            kind=JobKind.EVALUATE,
-            priority=Priority.EVALUATION,
-            params={**params, "automatic": False},
-        )
+        params["automatic"] = False
+        job = Job(map_id=map_.id, kind=JobKind.EVALUATE, params=params)
         return idempotent.accept_job(session, job)
 
 
-@router.get("/evaluations", operation_id="list_evaluations", dependencies=[READ])
-def read_evaluations(gateway: GatewayDep, query: PageQuery) -> EvaluationsResponse:
+@router.get("/evaluations", dependencies=[READ])
+def list_evaluations(gateway: GatewayDep, query: PageQuery) -> EvaluationsResponse:
     """List evaluations, newest first, including automatic ones."""
-    before = query.before
     with gateway.catalog.read() as session:
-        map_id = get_map(session, query.map).id
-        rows = list_evaluations(session, map_id, query.limit + 1, before)
-    page, next_cursor = query.split(rows)
+        is_of_map = Evaluation.map_id == get_map(session, query.map).id
+        page, next_cursor = query.read(session, Evaluation, is_of_map)
     return EvaluationsResponse(
         evaluations=[EvaluationResponse.model_validate(row) for row in page],
         next_cursor=next_cursor,

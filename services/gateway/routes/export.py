@@ -25,7 +25,8 @@ from services.gateway.authentication import READ
 from services.gateway.dependencies import GatewayDep, GenerationId, MapQuery
 from services.gateway.responses import describe_tar, tar_response
 from shared.catalog.chunks import Descriptor, list_live_chunks
-from shared.catalog.generations import Generation, get_generation
+from shared.catalog.database.base import get_in_map
+from shared.catalog.generations import Generation
 from shared.catalog.maps import get_map
 from shared.catalog.photos import Photo
 from shared.ingest.photo_metadata import escape_csv_text
@@ -62,7 +63,6 @@ class _ChunkRows:
 @router.get(
     "/generations/{generation_id}/descriptors",
     dependencies=[READ],
-    operation_id="export_descriptors",
     response_class=StreamingResponse,
     responses=describe_tar("A tar with `photos.csv`, `names.txt` and `descriptors.npy`."),
 )
@@ -75,7 +75,7 @@ def export_descriptors(
     rows; `photos.csv` and `names.txt` are in the same order.
     """
     with contextlib.ExitStack() as files, gateway.catalog.read() as session:
-        generation = get_generation(session, get_map(session, query.map).id, generation_id)
+        generation = get_in_map(session, Generation, get_map(session, query.map).id, generation_id)
         table = files.enter_context(tempfile.SpooledTemporaryFile(SPOOL_BYTES))
         names = files.enter_context(tempfile.SpooledTemporaryFile(SPOOL_BYTES))
         chunks = _write_tables(session, generation, table, names)

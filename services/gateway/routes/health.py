@@ -136,7 +136,7 @@ def service_info() -> ServiceResponse:
 
 
 @probe_router.head("/livez", include_in_schema=False)
-@probe_router.get("/livez", operation_id="livez")
+@probe_router.get("/livez")
 def livez() -> ProbeResponse:
     """Liveness probe: 200 while the process responds. It checks nothing else."""
     return ProbeResponse(status="alive")
@@ -145,7 +145,6 @@ def livez() -> ProbeResponse:
 @probe_router.head("/readyz", include_in_schema=False)
 @probe_router.get(
     "/readyz",
-    operation_id="readyz",
     responses={503: {"model": ProbeResponse, "description": "A component is unavailable."}},
 )
 def readyz(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> ProbeResponse:

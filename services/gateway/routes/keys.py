@@ -9,7 +9,8 @@ from pydantic import Field
 
 from services.gateway.authentication import ADMIN
 from services.gateway.dependencies import NO_NUL_PATTERN, NO_PARAMETERS, GatewayDep, KeyId
-from shared.catalog.api_keys import KeyLimits, create_api_key, list_api_keys, revoke_api_key
+from shared.catalog.api_keys import ApiKey, KeyLimits, create_api_key, revoke_api_key
+from shared.catalog.database.base import list_newest
 from shared.catalog.maps import MAP_NAME_PATTERN
 from shared.http.request_model import RequestModel
 from shared.responses.maps import CreatedKeyResponse, KeyResponse
@@ -47,14 +48,14 @@ class CreateKeyRequest(RequestModel):
     max_photos: KeyLimit = None
 
 
-@router.get("/keys", operation_id="list_keys", dependencies=[ADMIN])
-def read_keys(gateway: GatewayDep) -> list[KeyResponse]:
+@router.get("/keys", dependencies=[ADMIN])
+def list_keys(gateway: GatewayDep) -> list[KeyResponse]:
     """List all keys, newest first, including revoked ones. The secrets are not stored."""
     with gateway.catalog.read() as session:
-        return [KeyResponse.model_validate(key) for key in list_api_keys(session)]
+        return [KeyResponse.model_validate(key) for key in list_newest(session, ApiKey)]
 
 
-@router.post("/keys", operation_id="create_key", status_code=201, dependencies=[ADMIN])
+@router.post("/keys", status_code=201, dependencies=[ADMIN])
 def create_key(gateway: GatewayDep, body: CreateKeyRequest) -> CreatedKeyResponse:
     """Create a key. The secret is shown only in this response and is not stored.
 
@@ -75,8 +76,8 @@ def create_key(gateway: GatewayDep, body: CreateKeyRequest) -> CreatedKeyRespons
         return CreatedKeyResponse.of_row(api_key, key=secret)
 
 
-@router.delete("/keys/{key_id}", operation_id="revoke_key", dependencies=[ADMIN])
-def revoke_key_by_id(gateway: GatewayDep, key_id: KeyId) -> KeyResponse:
+@router.delete("/keys/{key_id}", dependencies=[ADMIN])
+def revoke_key(gateway: GatewayDep, key_id: KeyId) -> KeyResponse:
     """Revoke a key. All gateways refuse it at once; it stays in the list."""
     with gateway.catalog.write() as session:
         return KeyResponse.model_validate(revoke_api_key(session, key_id))

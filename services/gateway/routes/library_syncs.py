@@ -13,8 +13,7 @@ from services.gateway.responses import JobAcceptedResponse
 from shared.catalog.jobs import UNFINISHED_STATES, list_jobs
 from shared.catalog.maps import get_map, lock_map
 from shared.http.request_model import RequestModel
-from shared.ids import new_id
-from shared.jobs import Job, JobKind, Priority
+from shared.jobs import Job, JobKind
 from shared.jobs.transitions import requeue_job_as_new
 
 router = APIRouter(tags=["model changes"])
@@ -28,9 +27,7 @@ class LibrarySyncRequest(RequestModel):
     )
 
 
-@router.post(
-    "/library-syncs", operation_id="sync_library", status_code=202, dependencies=[WRITE, ADMIT_JOB]
-)
+@router.post("/library-syncs", status_code=202, dependencies=[WRITE, ADMIT_JOB])
 def sync_library(
     gateway: GatewayDep, idempotent: IdempotentDep, query: MapQuery, options: LibrarySyncRequest
 ) -> JobAcceptedResponse:
@@ -46,8 +43,7 @@ def sync_library(
         map_ = lock_map(session, get_map(session, query.map).id)
         job = next(iter(list_jobs(session, map_.id, (), (JobKind.SYNC_LIBRARY,), 1, None)), None)
         if job is None:
-            kind, priority = JobKind.SYNC_LIBRARY, Priority.BATCH
-            job = Job(id=new_id(), map_id=map_.id, kind=kind, priority=priority, params=params)
+            job = Job(map_id=map_.id, kind=JobKind.SYNC_LIBRARY, params=params)
         else:
             job.params = params
             if job.state not in UNFINISHED_STATES:

@@ -165,7 +165,7 @@ def read_map(gateway: GatewayDep, name: MapNamePath) -> MapResponse:
         return _map_response(session, gateway.settings, get_map(session, name))
 
 
-@router.patch("/maps/{name}", operation_id="update_map", dependencies=[WRITE, CHECK_MAP])
+@router.patch("/maps/{name}", dependencies=[WRITE, CHECK_MAP])
 def update_map(gateway: GatewayDep, name: MapNamePath, body: UpdateMapRequest) -> MapResponse:
     """Change settings of the map: labels that are paths, stored descriptors, fits, matching, and
     how many queries are from elsewhere.
@@ -206,7 +206,7 @@ def update_map(gateway: GatewayDep, name: MapNamePath, body: UpdateMapRequest) -
     return response
 
 
-@router.delete("/maps/{name}", operation_id="delete_map", dependencies=[WRITE, CHECK_MAP])
+@router.delete("/maps/{name}", dependencies=[WRITE, CHECK_MAP])
 def delete_map(gateway: GatewayDep, name: MapNamePath) -> DeletedMapResponse:
     """Delete a map with all its photos. An empty map `default` is created again.
 
@@ -219,9 +219,7 @@ def delete_map(gateway: GatewayDep, name: MapNamePath) -> DeletedMapResponse:
         mark_map_deleted(session, map_)
         if name == DEFAULT_MAP:
             settings = gateway.settings
-            get_or_create_default_map(
-                session, settings.new_map_extractor, RowType(settings.descriptor_rows)
-            )
+            get_or_create_default_map(session, settings.new_map_extractor, settings.descriptor_rows)
 
     gateway.catalog.run(remove)
     return DeletedMapResponse(success=True, message=f"The map {name} is deleted.", deleted_map=name)

@@ -17,11 +17,12 @@ from services.gateway.idempotency import IdempotentDep, IdempotentFormDep, Idemp
 from services.gateway.responses import JobAcceptedResponse
 from services.gateway.uploads.multipart import FormFile, multipart_schema, receive_form_file
 from shared.catalog.chunks import estimate_described
-from shared.catalog.generations import list_generations
+from shared.catalog.database.base import list_newest
+from shared.catalog.generations import Generation
 from shared.catalog.maps import get_map
 from shared.catalog.models import check_model_registered
 from shared.catalog.photos import PhotoRole, has_live_photo
-from shared.catalog.vocabularies import get_pca_source_generation, get_vocabulary, list_vocabularies
+from shared.catalog.vocabularies import Vocabulary, get_pca_source_generation, get_vocabulary
 from shared.config.settings import Settings
 from shared.errors import Conflict, Misconfigured, invalid_field_error
 from shared.extractor_config.configs import (
@@ -83,10 +84,8 @@ class StartGenerationRequest(RequestModel):
     )
 
 
-@router.post(
-    "/vocabularies", operation_id="fit_vocabulary", status_code=202, dependencies=[WRITE, ADMIT_JOB]
-)
-def start_vocabulary_fit(
+@router.post("/vocabularies", status_code=202, dependencies=[WRITE, ADMIT_JOB])
+def fit_vocabulary(
     gateway: GatewayDep,
     idempotent: IdempotentDep,
     query: MapQuery,
@@ -110,7 +109,6 @@ def start_vocabulary_fit(
 
 @router.post(
     "/vocabularies/import",
-    operation_id="import_vocabulary",
     status_code=202,
     openapi_extra=multipart_schema(
         "a `.npz` file of `placewise vocabulary fit DIR`, or a `.npy` file of "
@@ -118,7 +116,7 @@ def start_vocabulary_fit(
     ),
     dependencies=[WRITE, ADMIT_JOB],
 )
-async def start_vocabulary_import(
+async def import_vocabulary(
     request: Request,
     gateway: GatewayDep,
     idempotent: IdempotentFormDep,
@@ -150,17 +148,17 @@ def _queue_import(
     return accepted
 
 
-@router.get("/vocabularies", operation_id="list_vocabularies", dependencies=[READ])
-def read_vocabularies(gateway: GatewayDep, query: MapQuery) -> list[VocabularyResponse]:
+@router.get("/vocabularies", dependencies=[READ])
+def list_vocabularies(gateway: GatewayDep, query: MapQuery) -> list[VocabularyResponse]:
     """List the vocabularies of a map, newest first, with their provenance."""
     with gateway.catalog.read() as session:
-        vocabularies = list_vocabularies(session, get_map(session, query.map).id)
+        is_of_map = Vocabulary.map_id == get_map(session, query.map).id
+        vocabularies = list_newest(session, Vocabulary, is_of_map)
     return [VocabularyResponse.model_validate(vocabulary) for vocabulary in vocabularies]
 
 
 @router.get(
     "/vocabularies/{vocabulary_id}/file",
-    operation_id="get_vocabulary_file",
     response_class=Response,
     responses={
         200: {
@@ -172,7 +170,7 @@ def read_vocabularies(gateway: GatewayDep, query: MapQuery) -> list[VocabularyRe
     },
     dependencies=[READ],
 )
-def read_vocabulary_file(gateway: GatewayDep, vocabulary_id: UUID, query: MapQuery) -> Response:
+def get_vocabulary_file(gateway: GatewayDep, vocabulary_id: UUID, query: MapQuery) -> Response:
     """Download a vocabulary as a file for `POST /vocabularies/import`.
 
     It is a `.npz` with its provenance, or a `.npy` (`application/octet-stream`) if the provenance
@@ -190,22 +188,18 @@ def read_vocabulary_file(gateway: GatewayDep, vocabulary_id: UUID, query: MapQue
     )
 
 
-@router.get("/generations", operation_id="list_generations", dependencies=[READ])
-def read_generations(gateway: GatewayDep, query: MapQuery) -> list[GenerationResponse]:
+@router.get("/generations", dependencies=[READ])
+def list_generations(gateway: GatewayDep, query: MapQuery) -> list[GenerationResponse]:
     """List the generations of a map, newest first."""
     with gateway.catalog.read() as session:
+        is_of_map = Generation.map_id == get_map(session, query.map).id
         return [
             GenerationResponse.of_row(generation, photos=estimate_described(session, generation.id))
-            for generation in list_generations(session, get_map(session, query.map).id)
+            for generation in list_newest(session, Generation, is_of_map)
         ]
 
 
-@router.post(
-    "/generations",
-    operation_id="start_generation",
-    status_code=202,
-    dependencies=[WRITE, ADMIT_JOB],
-)
+@router.post("/generations", status_code=202, dependencies=[WRITE, ADMIT_JOB])
 def start_generation(
     gateway: GatewayDep, idempotent: IdempotentDep, body: StartGenerationRequest, query: MapQuery
 ) -> JobAcceptedResponse:

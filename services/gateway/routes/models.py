@@ -46,8 +46,7 @@ from shared.extractor_config.names import (
     MODEL_NAME_PATTERN,
     MODEL_NAME_RULE,
 )
-from shared.ids import new_id
-from shared.jobs import Job, JobKind, Priority
+from shared.jobs import Job, JobKind
 from shared.jobs.wakeups import JobMessage
 from shared.responses import ResponseModel
 from shared.responses.maps import ModelResponse, RemovedModelResponse
@@ -110,7 +109,6 @@ class ModelsResponse(ResponseModel):
 
 @router.post(
     "/models",
-    operation_id="add_model",
     status_code=202,
     openapi_extra=multipart_schema(
         "a checkpoint (`.ckpt`) of `placewise train`, a TorchScript or an `.onnx` file",
@@ -119,7 +117,7 @@ class ModelsResponse(ResponseModel):
     ),
     dependencies=[ADMIN, ADMIT_JOB],
 )
-async def upload_model(
+async def add_model(
     request: Request,
     gateway: GatewayDep,
     idempotent: IdempotentFormDep,
@@ -150,10 +148,8 @@ def _queue_model(
     upload = file.complete()
     with idempotent.begin_form(upload), gateway.catalog.write() as session:
         job = Job(
-            id=new_id(),
             map_id=get_map(session, map_name).id,
             kind=JobKind.ADD_MODEL,
-            priority=Priority.MODEL_CHANGE,
             params={
                 "object_key": upload.key,
                 "filename": upload.filename,
@@ -166,18 +162,16 @@ def _queue_model(
     return accepted
 
 
-@router.get("/models", operation_id="list_models", dependencies=[READ, NO_PARAMETERS, ALL_MAPS])
-def read_models(gateway: GatewayDep) -> ModelsResponse:
+@router.get("/models", dependencies=[READ, NO_PARAMETERS, ALL_MAPS])
+def list_models(gateway: GatewayDep) -> ModelsResponse:
     """List the added models by name."""
     with gateway.catalog.read() as session:
         models = [_model_response(session, model) for model in list_registered_models(session)]
     return ModelsResponse(models=models)
 
 
-@router.get(
-    "/models/{name}", operation_id="get_model", dependencies=[READ, NO_PARAMETERS, ALL_MAPS]
-)
-def read_model(gateway: GatewayDep, name: ModelNamePath) -> ModelResponse:
+@router.get("/models/{name}", dependencies=[READ, NO_PARAMETERS, ALL_MAPS])
+def get_model(gateway: GatewayDep, name: ModelNamePath) -> ModelResponse:
     """Get one model."""
     with gateway.catalog.read() as session:
         return _model_response(session, get_registered_model(session, name))

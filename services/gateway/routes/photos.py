@@ -31,6 +31,7 @@ from services.gateway.dependencies import (
 from services.gateway.photo_search import MAX_COUNTED_MATCHES, MetadataSearchParams, search_photos
 from services.gateway.responses import JobAcceptedResponse, MetadataSearchResponse, photo_response
 from shared.catalog.chunks import find_descriptor
+from shared.catalog.database.base import insert_row
 from shared.catalog.generations import active_generation
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import get_map, increment_map_version, lock_map
@@ -56,7 +57,7 @@ from shared.ingest.photo_metadata import (
     parse_tags,
     parse_time,
 )
-from shared.jobs import Job, JobKind, JobState, Priority
+from shared.jobs import Job, JobKind, JobState
 from shared.jobs.transitions import cancel_jobs, requeue_job_as_new
 from shared.jobs.wakeups import JobMessage
 from shared.responses.jobs import DeletedPhotoResponse
@@ -124,7 +125,7 @@ class PhotoUpdate(RequestModel):
         return columns
 
 
-@router.patch("/uploads/{file_id}", operation_id="patch_photo", dependencies=[WRITE])
+@router.patch("/uploads/{file_id}", dependencies=[WRITE])
 def patch_photo(
     gateway: GatewayDep, file_id: FileId, patch: PhotoUpdate, query: MapQuery
 ) -> PhotoDetailResponse:
@@ -148,7 +149,7 @@ class DeletePhotoParams(MapParams):
     permanently: bool = Field(False, description="delete its bytes within seconds, for good")
 
 
-@router.delete("/uploads/{file_id}", operation_id="delete_photo", dependencies=[WRITE])
+@router.delete("/uploads/{file_id}", dependencies=[WRITE])
 def delete_photo(
     gateway: GatewayDep, file_id: FileId, query: Annotated[DeletePhotoParams, Query()]
 ) -> DeletedPhotoResponse:
@@ -173,7 +174,7 @@ def delete_photo(
     )
 
 
-@router.post("/uploads/{file_id}/restore", operation_id="restore_photo", dependencies=[WRITE])
+@router.post("/uploads/{file_id}/restore", dependencies=[WRITE])
 def restore_photo(
     gateway: GatewayDep, admission: AdmissionDep, file_id: FileId, query: MapQuery
 ) -> PhotoDetailResponse:
@@ -211,12 +212,11 @@ def restore_photo(
 
 @router.get(
     "/uploads/{file_id}/image",
-    operation_id="get_image",
     response_class=Response,
     responses=IMAGE_RESPONSE,
     dependencies=[READ],
 )
-def read_image(request: Request, gateway: GatewayDep, file_id: FileId, query: MapQuery) -> Response:
+def get_image(request: Request, gateway: GatewayDep, file_id: FileId, query: MapQuery) -> Response:
     """Get the original bytes of a photo."""
     with gateway.catalog.read() as session:
         photo = get_photo(session, get_map(session, query.map).id, file_id)
@@ -241,12 +241,11 @@ def _original_response(request: Request, gateway: GatewayContext, photo: Photo) 
 
 @router.get(
     "/uploads/{file_id}/thumbnail",
-    operation_id="get_thumbnail",
     response_class=Response,
     responses=IMAGE_RESPONSE,
     dependencies=[READ],
 )
-def read_thumbnail(gateway: GatewayDep, file_id: FileId, query: MapQuery) -> Response:
+def get_thumbnail(gateway: GatewayDep, file_id: FileId, query: MapQuery) -> Response:
     """Get a small JPEG without metadata; it exists once the photo has been described.
 
     Photos in the trash have it, too.
@@ -265,7 +264,6 @@ def read_thumbnail(gateway: GatewayDep, file_id: FileId, query: MapQuery) -> Res
 
 @router.get(
     "/uploads/{file_id}/preview",
-    operation_id="get_preview",
     response_class=Response,
     responses={
         **IMAGE_RESPONSE,
@@ -276,7 +274,7 @@ def read_thumbnail(gateway: GatewayDep, file_id: FileId, query: MapQuery) -> Res
     },
     dependencies=[READ],
 )
-def read_preview(
+def get_preview(
     request: Request,
     gateway: GatewayDep,
     admission: AdmissionDep,
@@ -331,12 +329,10 @@ def _queue_again(session: Session, photo: Photo) -> Job:
         job = Job(
             map_id=photo.map_id,
             kind=JobKind.INDEX,
-            priority=Priority.UPLOAD,
             photo_id=photo.id,
             result={"file_id": str(photo.id)},  # described before: webhooks get no second event
         )
-        session.add(job)
-        session.flush()
+        insert_row(session, job)
         get_photo(session, photo.map_id, photo.id).job_id = job.id
     else:
         requeue_job_as_new(job, keep_result=True)
@@ -344,8 +340,8 @@ def _queue_again(session: Session, photo: Photo) -> Job:
     return job
 
 
-@router.get("/search", operation_id="search_metadata", dependencies=[READ])
-def search_photos_by_metadata(
+@router.get("/search", dependencies=[READ])
+def search_metadata(
     gateway: GatewayDep, query: Annotated[MetadataSearchParams, Query()]
 ) -> MetadataSearchResponse:
     """Search photos by their metadata, newest first, with a cursor (of the same `sort`)."""

@@ -37,7 +37,7 @@ from services.gateway.routes.positions import (
 from services.gateway.similarity.execute import find_similar, query_from_photo
 from services.gateway.similarity.search_params import SearchParams
 from shared.catalog.chunks import count_searchable
-from shared.catalog.database.base import Condition, count_rows, for_update, list_newest
+from shared.catalog.database.base import Condition, count_rows, for_update
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map, increment_map_version, lock_map
 from shared.catalog.photos import Photo, has_given_place, is_geotagged
@@ -138,8 +138,8 @@ class UndoPlacesBody(RequestModel):
     )
 
 
-@router.post(PROPOSALS_PATH, operation_id="propose_places", dependencies=[READ])
-def propose_page(
+@router.post(PROPOSALS_PATH, dependencies=[READ])
+def propose_places(
     gateway: GatewayDep, query: Annotated[ProposalsParams, Query()], options: ProposalOptions
 ) -> PlaceProposalsResponse:
     """Propose places for the photos of a map that have neither coordinates nor a label.
@@ -155,8 +155,7 @@ def propose_page(
             ~is_geotagged(),
         )
         total = count_rows(session, select(Photo.id).where(*without))
-        photos = list_newest(session, Photo, *without, limit=query.limit + 1, before=query.before)
-    page, next_cursor = query.split(photos)
+        page, next_cursor = query.read(session, Photo, *without)
     return PlaceProposalsResponse(
         total=total,
         proposals=_propose_places(gateway, query.map, page, options),
@@ -164,8 +163,8 @@ def propose_page(
     )
 
 
-@router.post("/places", operation_id="give_places", dependencies=[WRITE])
-def give(gateway: GatewayDep, query: MapQuery, body: GivenPlacesBody) -> GivenPlacesResponse:
+@router.post("/places", dependencies=[WRITE])
+def give_places(gateway: GatewayDep, query: MapQuery, body: GivenPlacesBody) -> GivenPlacesResponse:
     """Give places to photos that have none, such as accepted proposals.
 
     A photo that has coordinates or a label is skipped. What a photo had before is kept: `POST
@@ -176,8 +175,8 @@ def give(gateway: GatewayDep, query: MapQuery, body: GivenPlacesBody) -> GivenPl
     )
 
 
-@router.post("/places/undo", operation_id="undo_places", dependencies=[WRITE])
-def undo(gateway: GatewayDep, query: MapQuery, body: UndoPlacesBody) -> UndonePlacesResponse:
+@router.post("/places/undo", dependencies=[WRITE])
+def undo_places(gateway: GatewayDep, query: MapQuery, body: UndoPlacesBody) -> UndonePlacesResponse:
     """Take back given places: photos have the values that they had before.
 
     A photo whose place was changed since is left as it is, and named.

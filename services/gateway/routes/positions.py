@@ -187,7 +187,7 @@ def read_header(
     return PhotoHeaderResponse.model_validate(header)
 
 
-@router.post(POSITIONS_PATH, operation_id="propose_positions", dependencies=[READ])
+@router.post(POSITIONS_PATH, dependencies=[READ])
 def propose_positions(
     gateway: GatewayDep, query: MapQuery, body: PositionsBody
 ) -> ProposalsResponse:
@@ -238,14 +238,8 @@ def _picture_evidence(search: SearchBody | None, photo_count: int) -> PictureEvi
     if search is None:
         return None
     return PictureEvidence(
-        [
-            SimilarPosition(each.latitude, each.longitude, each.score, each.name)
-            for each in search.similar
-        ],
-        [
-            ProbableCircle(each.latitude, each.longitude, each.radius_m, each.probability)
-            for each in search.circles
-        ],
+        [SimilarPosition(**each.model_dump()) for each in search.similar],
+        [ProbableCircle(**each.model_dump()) for each in search.circles],
         search.not_in_map,
         photo_count,
         PosePosition(**search.pose.model_dump()) if search.pose else None,

@@ -32,8 +32,7 @@ from shared.errors import Conflict, NotFound
 from shared.geodesy import distance_m
 from shared.geometry.colmap_model import ColmapModel, rename_images
 from shared.http.request_model import RequestModel
-from shared.ids import new_id
-from shared.jobs import Job, JobKind, Priority
+from shared.jobs import Job, JobKind
 from shared.jobs.wakeups import JobMessage
 from shared.responses import ResponseModel
 from shared.responses.reconstructions import (
@@ -81,13 +80,8 @@ class CoordinateProposalsResponse(ResponseModel):
     proposals: list[CoordinateProposalResponse] = Field(description="largest distance first")
 
 
-@router.post(
-    "/reconstructions",
-    operation_id="reconstruct",
-    status_code=202,
-    dependencies=[WRITE, ADMIT_JOB],
-)
-def start_reconstruction(
+@router.post("/reconstructions", status_code=202, dependencies=[WRITE, ADMIT_JOB])
+def reconstruct(
     gateway: GatewayDep,
     idempotent: IdempotentDep,
     query: MapQuery,
@@ -106,13 +100,8 @@ def start_reconstruction(
     )
 
 
-@router.post(
-    IMPORT_PATH,
-    operation_id="import_reconstruction",
-    status_code=202,
-    dependencies=[WRITE, ADMIT_JOB],
-)
-def start_import(
+@router.post(IMPORT_PATH, status_code=202, dependencies=[WRITE, ADMIT_JOB])
+def import_reconstruction(
     gateway: GatewayDep, idempotent: IdempotentDep, query: MapQuery, model: ColmapModel
 ) -> JobAcceptedResponse:
     """Use the cameras and poses of an existing COLMAP model, such as hloc's, for the map's photos.
@@ -133,13 +122,7 @@ def _queue(
         map_id = lock_map(session, get_map(session, map_name).id).id
         _check_not_running(session, map_id)
         check_reconstructable(session, map_id)
-        job = Job(
-            id=new_id(),
-            map_id=map_id,
-            kind=JobKind.RECONSTRUCT,
-            priority=Priority.MODEL_CHANGE,
-            params=params,
-        )
+        job = Job(map_id=map_id, kind=JobKind.RECONSTRUCT, params=params)
         accepted = idempotent.accept_job(session, job)
     gateway.wakeups.send(JobMessage.of(job, map_name))
     return accepted
@@ -178,12 +161,8 @@ def read_reconstruction(gateway: GatewayDep, query: MapQuery) -> ReconstructionR
         )
 
 
-@router.get(
-    "/reconstructions/{reconstruction_id}/proposals",
-    operation_id="list_coordinate_proposals",
-    dependencies=[READ],
-)
-def read_proposals(
+@router.get("/reconstructions/{reconstruction_id}/proposals", dependencies=[READ])
+def list_coordinate_proposals(
     gateway: GatewayDep, reconstruction_id: ReconstructionId, query: MapQuery
 ) -> CoordinateProposalsResponse:
     """List the photos whose coordinates disagree with the reconstruction, with proposed ones.
@@ -240,7 +219,6 @@ def _get_finished(session: Session, map_name: str, reconstruction_id: UUID) -> R
 
 @router.get(
     "/reconstructions/{reconstruction_id}/colmap",
-    operation_id="export_colmap",
     dependencies=[READ],
     response_class=StreamingResponse,
     responses=describe_tar(

@@ -68,12 +68,8 @@ JOB_PENDING: dict[int | str, dict[str, Any]] = {
 ERROR_BY_STATUS = {kind.status: kind for kind in (NotFound, Conflict, Gone)}
 
 
-@router.post(
-    "/similarity/{file_id}",
-    operation_id="similar_to_stored",
-    dependencies=[READ],
-)
-def search_by_stored_photo(
+@router.post("/similarity/{file_id}", dependencies=[READ])
+def similar_to_stored(
     gateway: GatewayDep,
     file_id: Annotated[FileId, PathParameter(description="a stored photo")],
     query: Annotated[SimilarityParams, Query()],
@@ -85,13 +81,12 @@ def search_by_stored_photo(
 
 @router.post(
     "/similarity",
-    operation_id="similar_to_upload",
     response_model=SimilarityResponse,
     responses=JOB_PENDING,
     openapi_extra=multipart_schema("the query photo"),
     dependencies=[READ, ADMIT_QUERY],
 )
-async def search_by_uploaded_photo(
+async def similar_to_upload(
     request: Request,
     response: Response,
     gateway: GatewayDep,
@@ -143,14 +138,8 @@ async def localise_by_geopose_protocol(
     return GeoPoseResponse.of(sent, await run_in_threadpool(_result_of, gateway, described))
 
 
-@router.get(
-    "/jobs/{job_id}/result",
-    operation_id="similarity_result",
-    dependencies=[READ],
-)
-def read_similarity_result(
-    gateway: GatewayDep, job_id: JobId, query: MapQuery
-) -> SimilarityResponse:
+@router.get("/jobs/{job_id}/result", dependencies=[READ])
+def similarity_result(gateway: GatewayDep, job_id: JobId, query: MapQuery) -> SimilarityResponse:
     """Get the result of a succeeded query job; 409 while it is unfinished."""
     with gateway.catalog.read() as session:
         job = get_job(session, get_map(session, query.map).id, job_id)
@@ -168,12 +157,11 @@ def read_similarity_result(
 
 @router.get(
     "/jobs/{job_id}/preview",
-    operation_id="get_query_preview",
     response_class=Response,
     responses={200: {"content": {"image/jpeg": {}}, "description": "the preview"}},
     dependencies=[READ],
 )
-def read_query_preview(gateway: GatewayDep, job_id: JobId, query: MapQuery) -> Response:
+def get_query_preview(gateway: GatewayDep, job_id: JobId, query: MapQuery) -> Response:
     """Get an uploaded query photo as browsers show it: an upright JPEG of at most 1,600 pixels.
 
     It exists once the photo is described, if the photo is a HEIC, TIFF or BMP file, until the query

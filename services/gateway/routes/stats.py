@@ -9,7 +9,7 @@ from services.gateway.authentication import READ
 from services.gateway.dependencies import GatewayDep, MapQuery, PageQuery
 from shared.catalog.chunks import Chunk
 from shared.catalog.generations import active_generation
-from shared.catalog.maps import get_map, get_map_statistics, list_searches
+from shared.catalog.maps import Search, get_map, get_map_statistics
 from shared.catalog.processes import list_processes
 from shared.catalog.vocabularies import next_fit_photos, vocabulary_standing
 from shared.responses import ResponseModel
@@ -23,21 +23,20 @@ class SearchHistoryResponse(ResponseModel):
     next_cursor: str | None
 
 
-@router.get("/searches", operation_id="list_searches", dependencies=[READ])
-def read_searches(gateway: GatewayDep, query: PageQuery) -> SearchHistoryResponse:
+@router.get("/searches", dependencies=[READ])
+def list_searches(gateway: GatewayDep, query: PageQuery) -> SearchHistoryResponse:
     """List similarity searches, newest first. They are kept for SEARCH_HISTORY_DAYS."""
     with gateway.catalog.read() as session:
-        map_id = get_map(session, query.map).id
-        searches = list_searches(session, map_id, query.limit + 1, query.before)
-    page, next_cursor = query.split(searches)
+        is_of_map = Search.map_id == get_map(session, query.map).id
+        page, next_cursor = query.read(session, Search, is_of_map)
     return SearchHistoryResponse(
         searches=[SearchHistoryEntry.model_validate(search) for search in page],
         next_cursor=next_cursor,
     )
 
 
-@router.get("/database/stats", operation_id="database_stats", dependencies=[READ])
-def read_stats(gateway: GatewayDep, query: MapQuery) -> StatsResponse:
+@router.get("/database/stats", dependencies=[READ])
+def database_stats(gateway: GatewayDep, query: MapQuery) -> StatsResponse:
     """Get statistics of a map. Search times cover the last seven days.
 
     For maps with more than 10,000 photos, jobs or searches, the statistics are cached; `counted_at`

@@ -47,6 +47,7 @@ from services.gateway.tracks.schemas import (
 )
 from services.gateway.uploads.multipart import FormFile, multipart_schema, parse_form
 from services.gateway.uploads.query_photo import describe_query_job, receive_query_photo
+from shared.catalog.database.base import insert_row
 from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import QUERY_TTL_SECONDS
 from shared.catalog.maps import get_map
@@ -61,11 +62,9 @@ from shared.catalog.tracks import (
     get_frame,
     get_track,
     latest_states,
-    list_tracks,
     select_frames,
 )
 from shared.errors import Conflict
-from shared.ids import new_id
 from shared.imaging.photo_header import read_photo_header
 from shared.jobs.wakeups import JobMessage
 from shared.responses import ResponseModel
@@ -103,9 +102,7 @@ FRAME_PENDING: dict[int | str, dict[str, Any]] = {
 }
 
 
-@router.post(
-    "/tracks", operation_id="begin_track", status_code=201, dependencies=[READ, CHECK_DISK]
-)
+@router.post("/tracks", status_code=201, dependencies=[READ, CHECK_DISK])
 def begin_track(
     request: Request,
     gateway: GatewayDep,
@@ -116,25 +113,22 @@ def begin_track(
     """Begin a track in the map. Then add frames in the order of their times."""
     with reserve_photo_quota(request, gateway.settings), gateway.catalog.write() as session:
         track = Track(
-            id=new_id(),
             map_id=get_map(session, query.map).id,
             params=body.model_dump(mode="json", exclude_none=True),
             key_id=get_caller(request).key_id,
         )
-        session.add(track)
-        session.flush()
-        session.refresh(track)
+        session.refresh(insert_row(session, track))
         response = TrackResponse(**_track_fields(gateway, track, None))
         idempotent.store_response(session, 201, response)
     return response
 
 
-@router.get("/tracks", operation_id="list_tracks", dependencies=[READ])
-def read_tracks(gateway: GatewayDep, page: PageQuery) -> TracksResponse:
+@router.get("/tracks", dependencies=[READ])
+def list_tracks(gateway: GatewayDep, page: PageQuery) -> TracksResponse:
     """List the tracks of the map, newest first, each with the state of its last applied frame."""
     with gateway.catalog.read() as session:
-        map_id = get_map(session, page.map).id
-        tracks, next_cursor = page.split(list_tracks(session, map_id, page.limit + 1, page.before))
+        is_of_map = Track.map_id == get_map(session, page.map).id
+        tracks, next_cursor = page.read(session, Track, is_of_map)
         last = latest_states(session, [track.id for track in tracks])
     return TracksResponse(
         tracks=[
@@ -192,7 +186,7 @@ def _read_track(gateway: GatewayContext, track_id: UUID, query: TrackReadParams)
     return Response(body.model_dump_json(), media_type="application/json")
 
 
-@router.delete("/tracks/{track_id}", operation_id="delete_track", dependencies=[WRITE])
+@router.delete("/tracks/{track_id}", dependencies=[WRITE])
 def delete_track(gateway: GatewayDep, track_id: TrackId, query: MapQuery) -> DeletedTrackResponse:
     """Delete a track with its frames."""
     with gateway.catalog.write() as session:
@@ -205,7 +199,6 @@ def delete_track(gateway: GatewayDep, track_id: TrackId, query: MapQuery) -> Del
 
 @router.post(
     "/tracks/{track_id}/frames",
-    operation_id="add_track_frame",
     response_model=TrackFrameResponse,
     responses=FRAME_PENDING,
     openapi_extra=multipart_schema("the frame's photo", ["captured_at"], **FRAME_FIELDS),
@@ -242,12 +235,11 @@ async def add_track_frame(
 
 @router.get(
     "/tracks/{track_id}/frames/{frame_id}",
-    operation_id="get_track_frame",
     response_model=TrackFrameResponse,
     responses=FRAME_PENDING,
     dependencies=[READ],
 )
-async def read_track_frame(
+async def get_track_frame(
     request: Request,
     response: Response,
     gateway: GatewayDep,
@@ -286,7 +278,6 @@ def _accept_frame(
         with reserve_photo_quota(request, gateway.settings), gateway.catalog.write() as session:
             track = get_track(session, get_map(session, map_name).id, track_id, lock=True)
             frame = TrackFrame(
-                id=new_id(),
                 track_id=track.id,
                 captured_at=form.captured_at,
                 job_id=job_id,
@@ -366,15 +357,11 @@ def _frame_response(
     status: Literal["pending", "applied", "failed"] = (
         "pending" if frame.pending else "failed" if frame.state is None else "applied"
     )
-    return TrackFrameResponse(
+    return TrackFrameResponse.of_row(
+        frame,
         frame_id=frame.id,
-        captured_at=frame.captured_at,
-        filename=frame.filename,
         status=status,
         state=smoothed or frame.state,
-        error=frame.error,
-        job_id=frame.job_id,
         job_url=job_url(frame.job_id, map_name),
         frame_url=url_in_map(f"/tracks/{frame.track_id}/frames/{frame.id}", map_name),
-        version=frame.version,
     )

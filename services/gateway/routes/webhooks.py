@@ -11,15 +11,15 @@ from pydantic import Field, model_validator
 
 from services.gateway.authentication import ADMIN
 from services.gateway.dependencies import NO_PARAMETERS, GatewayDep, PageParams, WebhookId
+from shared.catalog.database.base import list_newest
 from shared.catalog.webhooks import (
     Delivery,
     DeliveryState,
     EventKind,
+    Webhook,
     create_webhook,
     delete_webhook,
     get_webhook,
-    list_deliveries,
-    list_webhooks,
 )
 from shared.errors import PlacewiseError, invalid_field_error
 from shared.http.request_model import RequestModel
@@ -73,11 +73,12 @@ class DeliveriesResponse(ResponseModel):
     next_cursor: str | None
 
 
-@router.get("/webhooks", operation_id="list_webhooks", dependencies=[ADMIN, NO_PARAMETERS])
-def read_webhooks(gateway: GatewayDep) -> list[WebhookResponse]:
+@router.get("/webhooks", dependencies=[ADMIN, NO_PARAMETERS])
+def list_webhooks(gateway: GatewayDep) -> list[WebhookResponse]:
     """List webhooks, newest first, without their secrets."""
     with gateway.catalog.read() as session:
-        return [WebhookResponse.model_validate(webhook) for webhook in list_webhooks(session)]
+        webhooks = list_newest(session, Webhook, Webhook.deleted_at.is_(None))
+    return [WebhookResponse.model_validate(webhook) for webhook in webhooks]
 
 
 @router.post(
@@ -122,18 +123,14 @@ class DeliveriesParams(PageParams):
         return {name: value for name, value in values.items() if name != "map"}
 
 
-@router.get(
-    "/webhooks/{webhook_id}/deliveries", operation_id="list_deliveries", dependencies=[ADMIN]
-)
-def read_deliveries(
+@router.get("/webhooks/{webhook_id}/deliveries", dependencies=[ADMIN])
+def list_deliveries(
     gateway: GatewayDep, webhook_id: WebhookId, query: Annotated[DeliveriesParams, Query()]
 ) -> DeliveriesResponse:
     """List the deliveries of a webhook, newest first, kept for 30 days."""
-    before = query.before
     with gateway.catalog.read() as session:
-        webhook = get_webhook(session, webhook_id)
-        deliveries = list_deliveries(session, webhook.id, query.limit + 1, before)
-    page, next_cursor = query.split(deliveries)
+        is_of_webhook = Delivery.webhook_id == get_webhook(session, webhook_id).id
+        page, next_cursor = query.read(session, Delivery, is_of_webhook)
     return DeliveriesResponse(
         deliveries=[DeliveryResponse.of(delivery) for delivery in page], next_cursor=next_cursor
     )

@@ -124,17 +124,10 @@ FRAME_FIELDS: dict[str, dict[str, Any]] = FrameForm.model_json_schema()["propert
 
 def track_state_response(state: TrackState, fix: PositionFix | None) -> TrackStateResponse:
     """Return the state of a frame: where its pose is, if that is within the finest level."""
-    response = TrackStateResponse(
-        status=state.status,
+    response = TrackStateResponse.of_row(
+        state,
         image_id=None if state.photo is None else UUID(state.photo),
-        latitude=state.latitude,
-        longitude=state.longitude,
-        place=state.place,
-        heading=state.heading,
-        probability=state.probability,
         levels=[EstimateLevelResponse.model_validate(level) for level in state.levels],
-        radius_68_m=state.radius_68_m,
-        radius_95_m=state.radius_95_m,
         not_in_map_probability=state.outside,
     )
     finest_m = response.levels[0].radius_m if response.levels else None

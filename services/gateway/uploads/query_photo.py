@@ -16,7 +16,7 @@ from shared.errors import Gone
 from shared.ids import new_id
 from shared.imaging.photo_header import PhotoHeader
 from shared.ingest.validation import check_photo_signature
-from shared.jobs import Job, JobKind, Priority
+from shared.jobs import Job, JobKind
 from shared.storage.keys import query_key
 
 
@@ -52,7 +52,6 @@ def describe_query_job(
         id=job_id,
         map_id=map_id,
         kind=JobKind.DESCRIBE,
-        priority=Priority.QUERY,
         params={
             "filename": filename,
             "search_params": search_params.model_dump(mode="json"),

@@ -66,6 +66,7 @@ from shared.jobs.runner import MAX_ATTEMPTS, JobInterrupted, JobRunner
 from shared.jobs.transitions import cancel_batch_items, requeue_job, succeed_job
 from shared.storage import ObjectStore
 from shared.storage.keys import IMPORTS, new_original_key
+from shared.storage.protocol import writing
 from shared.utm_filenames import upload_fields_of_file_name
 
 log = logging.getLogger(__name__)
@@ -142,18 +143,13 @@ class _BatchItemImporter:
         """Copy the item's object to `key` and validate it meanwhile."""
         assert item.object_key is not None
         validator = StreamValidator(self._settings.max_file_size, check_photo_signature)
-        writer = self._store.writer(key)
-        try:
-            with self._store.open(item.object_key) as file:
-                while piece := file.read(OBJECT_READ_BYTES):
-                    validator.add(piece)
-                    writer.write(piece)
+        with self._store.open(item.object_key) as file, writing(self._store, key) as writer:
+            while piece := file.read(OBJECT_READ_BYTES):
+                validator.add(piece)
+                writer.write(piece)
             validator.end()
             if not validator.size_bytes:
                 raise InvalidRequest("empty_file", "The file is empty.")
-            writer.commit()
-        finally:
-            writer.abort()
         return StoredUpload(
             key=key,
             filename=base_name(item.name),

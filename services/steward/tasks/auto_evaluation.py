@@ -16,8 +16,7 @@ from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import Map, get_map_statistics, list_maps, lock_map
 from shared.config.settings import Settings
 from shared.evaluation.places.probability import PlaceModel
-from shared.ids import new_id
-from shared.jobs import Job, JobKind, JobState, Priority
+from shared.jobs import Job, JobKind, JobState
 
 AUTO_SAMPLE_PHOTOS = 300  # enough for a threshold at a false-accept rate of 5 %
 REEVALUATE_SHARE = 0.2  # change of the photo count after which a map is evaluated again
@@ -41,15 +40,7 @@ def evaluate_changed_maps(catalog: Catalog, settings: Settings) -> None:
             params = _due_params(session, map_id, min_photos)
             if params is None:
                 continue  # another steward has queued it
-            session.add(
-                Job(
-                    id=new_id(),
-                    map_id=map_id,
-                    kind=JobKind.EVALUATE,
-                    priority=Priority.EVALUATION,
-                    params=params,
-                )
-            )
+            session.add(Job(map_id=map_id, kind=JobKind.EVALUATE, params=params))
 
 
 def _due_params(session: Session, map_id: UUID, min_photos: int) -> dict[str, Any] | None:

@@ -26,8 +26,7 @@ from shared.catalog.generations import (
 from shared.catalog.jobs import UNFINISHED_STATES, WaitingFor
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
-from shared.ids import new_id
-from shared.jobs import Job, JobKind, JobState, Priority
+from shared.jobs import Job, JobKind, JobState
 from shared.jobs.transitions import CANCELLED_PER_TRANSACTION, cancel_jobs, succeed_job
 
 # What a model change waits for that the steward advances.
@@ -74,6 +73,7 @@ def _queue_photos(
     """Queue a reindex job for each missing one of the photos; return the number of jobs."""
     with catalog.read() as session:
         missing = _find_missing(session, generation.id, session.scalars(photo_ids).all())
+    reindex = {"kind": JobKind.REINDEX, "map_id": generation.map_id, "generation_id": generation.id}
     queued = 0
     for begin in range(0, len(missing), REINDEX_JOBS_PER_TRANSACTION):
         batch = missing[begin : begin + REINDEX_JOBS_PER_TRANSACTION]
@@ -88,21 +88,11 @@ def _queue_photos(
                 break
             still_missing = _find_missing(session, generation.id, batch)
             if still_missing:
-                rows = [_reindex_job(generation, photo_id) for photo_id in still_missing]
-                session.execute(insert(Job), rows)
+                session.execute(
+                    insert(Job), [{**reindex, "photo_id": id_} for id_ in still_missing]
+                )
             queued += len(still_missing)
     return queued
-
-
-def _reindex_job(generation: Generation, photo_id: UUID) -> dict[str, object]:
-    return {
-        "id": new_id(),
-        "map_id": generation.map_id,
-        "kind": JobKind.REINDEX,
-        "priority": Priority.REINDEX,
-        "photo_id": photo_id,
-        "generation_id": generation.id,
-    }
 
 
 def has_missing_photos(session: Session, generation: Generation, queued_chunks: set[UUID]) -> bool:

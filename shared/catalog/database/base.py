@@ -24,6 +24,7 @@ from sqlalchemy.types import Boolean, Float, Text, TypeDecorator
 
 from shared.errors import NotFound
 from shared.geodesy import EARTH_RADIUS_M, flush_to_zero
+from shared.ids import new_id
 
 SQLITE_DISTANCE_FUNCTION = "placewise_distance_m"
 
@@ -76,6 +77,14 @@ class Base(DeclarativeBase):
             "pk": "pk_%(table_name)s",
         }
     )
+
+
+class Entity(Base):
+    """Base of the tables whose rows have an id: a UUIDv7, by which they are in order of age."""
+
+    __abstract__ = True
+
+    id: Mapped[UUID] = mapped_column(sa.Uuid, primary_key=True, default=new_id, sort_order=-1)
 
 
 def partial_index(name: str, *columns: Any, only: Condition, unique: bool = False) -> sa.Index:
@@ -270,6 +279,13 @@ def get_in_map(
     return row
 
 
+def insert_row(session: Session, row: Row) -> Row:
+    """Insert a row at once, and return it with its id."""
+    session.add(row)
+    session.flush()
+    return row
+
+
 def get_or_insert(session: Session, statement: sa.Select[Row], row: Row) -> Row:
     """Return the row that `statement` selects; if there is none, insert and return `row`."""
     existing = session.scalar(statement)
@@ -277,11 +293,9 @@ def get_or_insert(session: Session, statement: sa.Select[Row], row: Row) -> Row:
         return existing
     try:
         with session.begin_nested():
-            session.add(row)
-            session.flush()
+            return insert_row(session, row)
     except IntegrityError:  # another process inserted it between the two statements
         return session.scalars(statement).one()
-    return row
 
 
 def count_rows(session: Session, statement: sa.Select[Any], limit: int | None = None) -> int:

@@ -13,7 +13,7 @@ from minio.error import S3Error
 
 from shared.errors import NotFound
 from shared.storage.keys import check_key, check_note_name
-from shared.storage.protocol import ObjectInfo
+from shared.storage.protocol import ObjectInfo, writing
 from shared.storage.s3.bucket import NO_SUCH_KEY_CODES, Bucket
 from shared.storage.s3.streams import MultipartUpload, S3Reader, S3Writer, read_range
 
@@ -31,12 +31,8 @@ class S3Store:
         return S3Writer(self.bucket, check_key(key))
 
     def put(self, key: str, data: bytes) -> None:
-        writer = self.writer(key)
-        try:
+        with writing(self, key) as writer:
             writer.write(data)
-            writer.commit()
-        finally:
-            writer.abort()
 
     def get(self, key: str) -> bytes:
         with S3Reader(self.bucket, check_key(key)) as file:

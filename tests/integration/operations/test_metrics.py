@@ -162,10 +162,10 @@ def test_an_extractor_counts_its_batches_stages_and_losses(averages: Harness) ->
     averages.drain()
     metrics: Any = averages.worker._metrics
     registry = CollectorRegistry()
-    registry.register(metrics._batch_jobs)
+    registry.register(metrics.batch_jobs)
     registry.register(metrics._jobs)
     registry.register(metrics._stage_seconds)
-    registry.register(metrics._load_seconds)
+    registry.register(metrics.model_load_seconds)
 
     def value(name: str, **labels: str) -> float | None:
         return registry.get_sample_value(name, labels)

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-import typer
 from typer.testing import CliRunner
 
+from services.cli.option_groups import CommandGroup
 from services.cli.query import query as query_command
 from tests.support.api_responses import PHOTO, POSE, SIMILAR
 from tests.support.fake_server import FakeServer, running_server
@@ -23,7 +23,7 @@ CIRCLES = [
     for radius_m, probability in ((25, 0.5), (100, 0.75), (500, 0.9), (2000, 0.96))
 ]
 
-app = typer.Typer()
+app = CommandGroup()
 app.command()(query_command)
 
 
