@@ -123,23 +123,14 @@ class Similarity:
 
     def as_json(self) -> dict[str, Any]:
         """Return what `from_json` reads."""
-        return {
-            "scale": self.scale,
-            "rotation": self.rotation.tolist(),
-            "translation": self.translation.tolist(),
-            "covariance": self.covariance.tolist(),
-            "pivot": self.pivot.tolist(),
-            "drift_m": self.drift_m,
-            "drift_radians": self.drift_radians,
-            "knows_altitude": self.knows_altitude,
-        }
+        return {name: np.asarray(value).tolist() for name, value in vars(self).items()}
 
     @classmethod
     def from_json(cls, value: dict[str, Any]) -> Self:
         """Return the similarity of `as_json`."""
-        arrays = ("rotation", "translation", "covariance", "pivot")
         read: dict[str, Any] = {
-            name: np.array(item, float) if name in arrays else item for name, item in value.items()
+            name: np.array(item, float) if isinstance(item, list) else item
+            for name, item in value.items()
         }
         return cls(**read)
 
@@ -406,15 +397,19 @@ def _refine(
     moved = scale * points @ rotation.T + translation
     residuals = (targets - moved)[is_inlier, :2]
     alike = _lag1_autocorrelation(residuals)
+    # Independent errors are alike by chance: their square correlation is 1 / size in the mean.
+    bent = math.sqrt(max(0.0, alike**2 - 1 / residuals.size))
     variance = float(np.mean(residuals**2))
+    # Turn, shift and scale fit four degrees of freedom of the noise.
+    unfitted = residuals.size / max(1, residuals.size - 4)
     found = Similarity(
         scale,
         rotation,
         translation,
-        np.linalg.inv(normal) * (1 + alike) / (1 - alike),
+        np.linalg.inv(normal) * (unfitted * (1 + alike) / (1 - alike)),
         moved.mean(axis=0),
-        math.sqrt(variance * alike),
-        _rotation_deviation(moved[is_inlier, :2], residuals, variance * (1 - alike)),
+        math.sqrt(variance * bent),
+        bent and _rotation_deviation(moved[is_inlier, :2], residuals, variance * (1 - alike)),
         knows_altitude,
     )
     return found, is_inlier

@@ -76,9 +76,11 @@ def geo_pose(
 
     The square of a radius is the sum of that of the pose in its component, the calibrated quantile
     times its standard deviation, that of the alignment at its position, and that of the camera
-    model. Heading, pitch and roll are relative to north and up at the position, not at the origin.
+    model, which moves no camera of the map. Heading, pitch and roll are relative to north and up at
+    the position, not at the origin.
     """
-    if pose.camera_source == CameraSource.MAP or pose.camera.rays is not None:
+    is_of_map = pose.camera_source == CameraSource.MAP
+    if is_of_map or pose.camera.rays is not None:
         calibration = calibration.known_lens or calibration
     place = origin.to_geographic(similarity.apply(pose.position))
     # From the plane at the position to that at the origin.
@@ -88,8 +90,11 @@ def geo_pose(
     sigma = similarity.scale * math.hypot(
         horizontal_sigma(pose.covariance, to_enu), calibration.position_floor
     )
-    depths = (pose.seen_points - pose.position) @ pose.rotation[2]
-    shift = CAMERA_MODEL_SIGMA * similarity.scale * float(np.median(depths)) if len(depths) else 0.0
+    shift = 0.0
+    if len(pose.seen_points) and not is_of_map:
+        # The map's own cameras share the errors of the model, which cancel out.
+        depths = (pose.seen_points - pose.position) @ pose.rotation[2]
+        shift = CAMERA_MODEL_SIGMA * similarity.scale * float(np.median(depths))
     aligned_68, aligned_95 = normal_radii(
         similarity.position_covariance(pose.position) + np.eye(3) * shift**2
     )
@@ -99,7 +104,7 @@ def geo_pose(
     jacobian = _heading_jacobian(rotation) @ turn.T
     turned = float(jacobian @ similarity.covariance[:3, :3] @ jacobian)
     off_axis = CAMERA_MODEL_SIGMA
-    if pose.camera_source == CameraSource.MAP and pose.camera.rays is None:
+    if is_of_map and pose.camera.rays is None:
         # What a camera of the map has beside its middle is in the turn of all its photos.
         off_axis = OTHER_LENS.principal_point / pose.camera.focal_length
     turned = math.sqrt(turned + similarity.drift_radians**2 + off_axis**2)

@@ -65,8 +65,7 @@ def test_error_of_the_alignment_is_in_every_radius_and_grows_with_the_distance()
     ]
     local = 4 * 2.0 * 0.1 * 2**0.5
     assert radii[0] == pytest.approx(np.hypot(local, 2.448 * shift), rel=1e-3)
-    expected = 1.96 * np.hypot(shift, turn * 1000)  # nearly all of it is east or west
-    assert radii[1] == pytest.approx(np.hypot(local, expected), rel=0.02)
+    assert radii[1] == pytest.approx(np.hypot(local, 1.96 * np.hypot(shift, 1000 * turn)), rel=0.02)
     exact = geo_pose(pose_at((0.0, 0.0, 1.0)), HERE, EXACT, CALIBRATION)
     found = geo_pose(pose_at((0.0, 0.0, 1.0)), HERE, off, CALIBRATION)
     assert found.heading_68_degrees > exact.heading_68_degrees + 0.5
@@ -84,8 +83,7 @@ def test_radii_of_normal_errors_hold_their_share(ratio: float) -> None:
 
 def test_heading_is_relative_to_north_at_the_position_itself() -> None:
     # From 1 km beside the pole to 1 km on its other side: north turns by 180 degrees.
-    near_pole = EastNorthUp(90 - 1 / 111.7, 0.0)
-    found = geo_pose(pose_at((0.0, 1000.0, 1.0)), near_pole, EXACT, CALIBRATION)
+    found = geo_pose(pose_at((0, 1e3, 1)), EastNorthUp(90 - 1 / 111.7, 0.0), EXACT, CALIBRATION)
     assert abs(found.longitude) == pytest.approx(180, abs=0.1)
     assert found.attitude.heading == pytest.approx(225, abs=0.1)
     assert found.attitude.pitch == pytest.approx(0, abs=0.05)
@@ -120,6 +118,8 @@ def test_errors_that_points_share_and_those_of_the_camera_model_are_in_the_radii
     depth_m = 2 * float((seen[0] - pose.position) @ pose.rotation[2])
     found = geo_pose(pose, HERE, EXACT, CALIBRATION)
     assert found.radius_68_m == pytest.approx(1.067 * 2**0.5 * 0.0025 * depth_m, rel=0.01)
+    of_map = geo_pose(replace(pose, camera_source=CameraSource.MAP), HERE, EXACT, CALIBRATION)
+    assert of_map.radius_68_m < 0.01 * found.radius_68_m
     floor = CALIBRATION.model_copy(update={"position_floor": 0.5, "heading_floor": 0.02})
     wider = geo_pose(pose, HERE, EXACT, floor)
     assert wider.radius_95_m == pytest.approx(np.hypot(4 * 2 * 0.5, found.radius_95_m), rel=0.01)
