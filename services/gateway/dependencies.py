@@ -41,6 +41,7 @@ MAX_WAIT_SECONDS = 60.0  # of `Prefer: wait` and `?wait=`
 NOTIFIER_POLL_SECONDS = 0.02
 POLL_COST_DIVISOR = 2  # at most a third of the time is spent polling: slow polls become rare
 MAX_POLL_PAUSE_SECONDS = 1.0  # after a slow poll: the jobs of waiting requests may have ended
+WAITED_SHARE = 0.05  # of the time since the latest request began to wait, as a pause: jobs are long
 # Requests may wait this long after the shutdown has begun. Most queries end within this time.
 SHUTDOWN_WAIT_SECONDS = 5.0
 CACHED_RANKINGS = 1000  # of about 50 photos: 20 MB
@@ -65,6 +66,7 @@ class JobNotifier:
         self._shutdown_wait_seconds = shutdown_wait_seconds
         self._waiters: set[_Waiter] = set()
         self._poll_task: asyncio.Task[None] | None = None
+        self._latest_wait = 0.0  # when it began
         self._shutdown_deadline = math.inf
 
     def begin_shutdown(self) -> None:
@@ -80,6 +82,7 @@ class JobNotifier:
         timeout = min(seconds, self._shutdown_deadline - time.monotonic())
         waiter = _Waiter(job_id, asyncio.get_running_loop().create_future())
         self._waiters.add(waiter)
+        self._latest_wait = time.monotonic()
         if self._poll_task is None:
             self._poll_task = asyncio.create_task(self._poll_while_awaited())
         try:
@@ -90,13 +93,17 @@ class JobNotifier:
             self._waiters.discard(waiter)
 
     async def _poll_while_awaited(self) -> None:
-        pause = NOTIFIER_POLL_SECONDS
+        pause, polled = NOTIFIER_POLL_SECONDS, 0.0
         try:
             while self._waiters:
                 await asyncio.sleep(pause)
                 started = time.monotonic()
+                waited = WAITED_SHARE * (started - self._latest_wait)
+                if started - polled < min(waited, MAX_POLL_PAUSE_SECONDS):
+                    continue
                 await self._poll(started)
-                elapsed = time.monotonic() - started
+                polled = time.monotonic()
+                elapsed = polled - started
                 pause = min(POLL_COST_DIVISOR * elapsed, MAX_POLL_PAUSE_SECONDS)
                 pause = max(NOTIFIER_POLL_SECONDS, pause)
         finally:

@@ -126,6 +126,25 @@ def test_waiting_requests_share_one_poll(catalog: Catalog, jobs: list[UUID]) -> 
         asyncio.run(scenario())
 
 
+def test_long_waits_are_polled_less_often(catalog: Catalog, jobs: list[UUID]) -> None:
+    """The first pace would be 100 polls in this time; a new request is answered as fast as ever."""
+    polls: list[str] = []
+
+    async def scenario() -> None:
+        notifier = JobNotifier(catalog)
+        wait = asyncio.create_task(notifier.wait_until_finished(jobs[0], LONG))
+        await asyncio.sleep(2.0)
+        assert len(polls) <= 70
+        await asyncio.sleep(2.0)
+        polls.clear()
+        await notifier.wait_until_finished(new_id(), LONG)
+        wait.cancel()
+
+    with on_each_select(catalog, polls.append):
+        asyncio.run(scenario())
+    assert len(polls) == 1
+
+
 def test_waiting_ends_with_an_outage_of_the_catalog(catalog: Catalog, jobs: list[UUID]) -> None:
     def fail(statement: str) -> None:
         raise OperationalError(statement, {}, Exception("unreachable"))
