@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 from uuid import UUID
 
@@ -124,16 +124,17 @@ class EvaluatedMap:
 
 @dataclass(slots=True)
 class Watched:
-    """A search port that has something done before its n-th search (counted from 1)."""
+    """A search port that notes its searches, and has something done before the n-th one."""
 
     port: SearchBackend
-    at: int
-    do: Callable[[], object]
-    searches: int = 0
+    at: int | None = None
+    """counted from 1"""
+    do: Callable[[], object] = lambda: None
+    searches: list[SearchRequest] = field(default_factory=list)
 
     def search(self, request: SearchRequest) -> SearchResponse:
-        self.searches += 1
-        if self.searches == self.at:
+        self.searches.append(request)
+        if len(self.searches) == self.at:
             self.do()
         return self.port.search(request)
 

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import httpx2
 import numpy as np
 import pytest
 
-from services.search.worker import SearchWorker
 from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Unavailable
@@ -19,17 +16,6 @@ from tests.support.local_features import SCENE_POINTS, SIZE, put_features, scene
 from tests.support.search_tier import SearchTier
 
 pytestmark = pytest.mark.databases("sqlite")
-
-
-@pytest.fixture(params=["in process", "over HTTP"])
-def backend(
-    request: pytest.FixtureRequest, catalog: Catalog, store: FolderStore, settings: Settings
-) -> Iterator[SearchBackend]:
-    if request.param == "in process":
-        yield SearchWorker(catalog, store, settings)
-    else:
-        with SearchTier(catalog, store, settings, 2) as tier:
-            yield tier.port
 
 
 def test_photos_of_the_query_s_scene_have_inliers_and_pairs_in_pixels_of_the_originals(

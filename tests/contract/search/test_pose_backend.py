@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import httpx2
 import numpy as np
 import pytest
 
-from services.search.worker import SearchWorker
 from shared.catalog.database.session import Catalog
 from shared.config.settings import Settings
 from shared.errors import Unavailable
@@ -44,17 +42,6 @@ from tests.support.search_tier import SearchTier
 
 pytestmark = pytest.mark.databases("sqlite")
 COMPONENT_KEY = "reconstructions/1/0.npz"
-
-
-@pytest.fixture(params=["in process", "over HTTP"])
-def backend(
-    request: pytest.FixtureRequest, catalog: Catalog, store: FolderStore, settings: Settings
-) -> Iterator[SearchBackend]:
-    if request.param == "in process":
-        yield SearchWorker(catalog, store, settings)
-    else:
-        with SearchTier(catalog, store, settings, 1) as tier:
-            yield tier.port
 
 
 @pytest.fixture

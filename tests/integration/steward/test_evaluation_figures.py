@@ -13,15 +13,6 @@ from services.steward.tasks.garbage_collection import collect_superseded_chunks
 from shared.catalog.chunks import Descriptor
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import Map
-from shared.search_api.protocol import (
-    MatchRequest,
-    MatchResponse,
-    PoseRequest,
-    PoseResponse,
-    SearchRequest,
-    SearchResponse,
-    SearchStatus,
-)
 from tests.integration.evaluated_map import EvaluatedMap, Watched
 from tests.integration.steward.streets import HOUR, NOON, STREETS, WITHOUT_PLACE, at, query
 from tests.support.catalog_rows import delete, merge_all, read_job
@@ -136,26 +127,10 @@ def test_a_sample_is_of_its_size_and_comes_from_its_seed(city: EvaluatedMap) -> 
 
 def queried_photos(city: EvaluatedMap, **params: Any) -> list[UUID]:
     """The photos that an evaluation searches with; a search may be repeated with a larger k."""
-    seen: dict[UUID, None] = {}
-    search = city.search.search
-
-    class Noting:
-        def search(self, request: SearchRequest) -> SearchResponse:
-            seen.update(dict.fromkeys(request.exclude))
-            return search(request)
-
-        def match(self, request: MatchRequest) -> MatchResponse:
-            return city.search.match(request)
-
-        def estimate_pose(self, request: PoseRequest) -> PoseResponse:
-            return city.search.estimate_pose(request)
-
-        def status(self) -> SearchStatus:
-            return city.search.status()
-
+    watched = Watched(city.search)
     city.start(**params)
-    assert city.work(Noting())
-    return list(seen)
+    assert city.work(watched)
+    return list(dict.fromkeys(photo for request in watched.searches for photo in request.exclude))
 
 
 @pytest.mark.parametrize(
