@@ -30,7 +30,6 @@ from services.cli.ingest.upload import (
     NoFitOption,
     UpdateOption,
     manifest_has_keys,
-    switch_off_fits,
     upload_photos,
     wait_for_batch,
 )
@@ -190,7 +189,7 @@ def index(
         progress = stack.enter_context(progress_bar())
         print_note(f"Indexing into {describe_target(client, server, map_name)}")
         if no_fit:
-            switch_off_fits(client)
+            client.update_map(client.stats().map, auto_fit=False)
         if batch is not None:
             report = wait_for_batch(client, batch(client), progress)
         else:
@@ -251,9 +250,8 @@ def _print_report(report: Json, server: str | None, map_name: str | None, role: 
             "time is taken as UTC. Pass the zone: --time-zone +02:00 or --time-zone Europe/Paris."
         )
     if report.get("not_understood"):
-        number = len(report["not_understood"])
-        have = "photo has" if number == 1 else "photos have"
-        print_note(f"{number} {have} a GPS tag that could not be read:")
+        number = _count(len(report["not_understood"]), "photo")
+        print_note(f"{number} with a GPS tag that could not be read:")
         for item in report["not_understood"]:
             print_note(f"{printable_text(item['path'])}: {item['reason']}")
     print_failures(report, "refused", "failed")
