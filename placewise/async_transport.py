@@ -193,8 +193,8 @@ class AsyncTransport:
         except httpx2.TransportError as error:
             raise Unavailable(
                 "server_unreachable",
-                f"Can't reach Placewise at {self.url} ({type(error).__name__}). Check that it "
-                "runs.",
+                f"Can't reach Placewise at {self.url} ({str(error) or type(error).__name__}). "
+                "Check the URL, and that it runs.",
             ) from error
         if response.is_success:
             return response

@@ -71,18 +71,20 @@ class RetryPolicy:
 
 
 def validate_url(url: str, key: str | None) -> str:
-    """Validate a server's URL and API key; returns the URL without a trailing slash.
+    """Validate a server's URL and API key; returns the URL without `/api/v1` and trailing slash.
 
     Raises:
         InvalidRequest: `bad_address`; `bad_key` for a key that is not printable ASCII.
     """
     if key is not None and not (key.isascii() and key.isprintable()):
         raise InvalidRequest("bad_key", "An API key must consist of printable ASCII characters.")
-    if not url.startswith(("http://", "https://")):
-        raise InvalidRequest(
-            "bad_address", f"{url!r} is not a valid URL such as http://127.0.0.1:8000."
-        )
-    return url.rstrip("/")
+    with contextlib.suppress(httpx2.InvalidURL):
+        parsed = httpx2.URL(url)
+        if parsed.scheme in ("http", "https") and parsed.host and not parsed.query:
+            return url.rstrip("/").removesuffix(API)
+    raise InvalidRequest(
+        "bad_address", f"{url!r} is not a valid URL such as http://127.0.0.1:8000."
+    )
 
 
 def response_error(response: httpx2.Response) -> PlacewiseError:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Annotated
+from functools import partial
 
 import typer
 from rich.progress import Progress
@@ -40,27 +41,27 @@ def connect(server: str | None, map_name: str | None, key: str | None) -> Iterat
         Unavailable: `server_unreachable` if the embedded server does not start in time.
     """
     settings = read_settings()
-    running_server = (
-        RunningServer(server) if server else find_running_server(settings.placewise_home)
-    )
+    find = partial(find_running_server, settings.placewise_home, START_TIMEOUT_SECONDS)
+    running_server = RunningServer(server) if server else find()
+    if running_server is None:
+        if settings.search_worker_urls:
+            raise Misconfigured(
+                "separate_services",
+                "SEARCH_URLS is set, so the command starts no server of its own. Name the gateway: "
+                "--server URL, or for example PLACEWISE_SERVER=http://127.0.0.1:8000.",
+            )
+        print_note(
+            f"No server runs on {settings.placewise_home}: starting one for this command. "
+            "--server URL or PLACEWISE_HOME selects another."
+        )
+        with collection_paused():  # clients of a running server don't need it
+            from services.standalone import run_standalone
+        running_server = find()  # importing takes seconds, in which another command may start one
     if running_server is not None:
         key = key or running_server.key
         with Client(running_server.url, key=key, map=map_name, patience_seconds=0) as client:
             yield client
         return
-    if settings.search_worker_urls:
-        raise Misconfigured(
-            "separate_services",
-            "SEARCH_URLS is set, so the command starts no server of its own. Name the gateway: "
-            "--server URL, or for example PLACEWISE_SERVER=http://127.0.0.1:8000.",
-        )
-    print_note(
-        f"No server runs on {settings.placewise_home}: starting one for this command. "
-        "--server URL or PLACEWISE_HOME selects another."
-    )
-    with collection_paused():
-        from services.standalone import run_standalone  # clients of a running server don't need it
-
     embedded_settings = settings.model_copy(update={"host": "127.0.0.1", "port": 0})
     with run_standalone(embedded_settings, lazy_extractor=True) as running:
         # In a thread: in the main thread, uvicorn would install its own signal handlers.

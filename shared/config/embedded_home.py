@@ -6,6 +6,7 @@ import contextlib
 import json
 import logging
 import os
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,15 +34,19 @@ def server_address_file(home: Path) -> Path:
     return home / "server.json"
 
 
-def find_running_server(home: Path) -> RunningServer | None:
-    """Return the server that serves the folder now, or None."""
-    if not _lock_file(home).exists():
-        return None
-    with contextlib.suppress(Timeout), FileLock(_lock_file(home), timeout=0, mode=FILE_MODE):
-        return None
-    with contextlib.suppress(FileNotFoundError, ValueError, KeyError):
-        address = json.loads(server_address_file(home).read_text())
-        return RunningServer(address["url"], address.get("key"))
+def find_running_server(home: Path, wait_seconds: float = 0) -> RunningServer | None:
+    """Return the server that serves the folder now or, if one starts, in `wait_seconds`."""
+    deadline, lock = time.monotonic() + wait_seconds, _lock_file(home)
+    with contextlib.suppress(PermissionError):
+        while lock.exists():
+            with contextlib.suppress(Timeout), FileLock(lock, timeout=0, mode=FILE_MODE):
+                return None
+            with contextlib.suppress(FileNotFoundError, ValueError, KeyError):
+                address = json.loads(server_address_file(home).read_text())
+                return RunningServer(address["url"], address.get("key"))
+            if time.monotonic() >= deadline:
+                return None
+            time.sleep(0.1)
     return None
 
 

@@ -240,7 +240,8 @@ def _is_deeper_than(levels: int, value: Any) -> bool:
 
 MAX_MANIFEST_BYTES = 32 * 1024 * 1024
 NAME_COLUMNS = ("filename", "file", "path")
-CSV_COLUMNS = ("latitude", "longitude", "altitude", "heading", "captured_at", "place", "tags")
+NUMBER_COLUMNS = ("latitude", "longitude", "altitude", "heading")
+CSV_COLUMNS = (*NUMBER_COLUMNS, "captured_at", "place", "tags")
 KEY_FIELD = "key"  # in a manifest of objects to import
 FORMULA = re.compile("'*[=+@\\t\\r-]")  # such a cell is a formula in a spreadsheet, or was escaped
 MAX_LINE_BYTES = 1_000_000  # of a manifest: metadata with each character escaped
@@ -274,13 +275,16 @@ def unescape_csv_text(cell: str) -> str:
 def read_csv_manifest(data: bytes, source_name: str) -> list[ManifestEntry]:
     """Parse a CSV table with a column of names (NAME_COLUMNS) and any of CSV_COLUMNS.
 
-    Text may be as `escape_csv_text` writes it. Errors name the table `source_name`.
+    Text may be as `escape_csv_text` writes it. Separators may be semicolons, with decimal commas,
+    or tabs, as spreadsheets write them. Errors name the table `source_name`.
 
     Raises:
         InvalidRequest: `bad_table`.
     """
     try:
-        reader = csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""))
+        text = data.decode("utf-8-sig")
+        separator = max(",;\t", key=text.partition("\n")[0].count)
+        reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator)
         columns = reader.fieldnames or []
         name_column = next((c for c in NAME_COLUMNS if c in columns), None)
         if name_column is None:
@@ -300,25 +304,25 @@ def read_csv_manifest(data: bytes, source_name: str) -> list[ManifestEntry]:
             )
         entries: list[ManifestEntry] = []
         seen: dict[str, int] = {}
-        for row in reader:
+        for row in filter(lambda row: any(row.values()), reader):  # spreadsheets add empty rows
             name = unescape_csv_text(row[name_column] or "")  # a short row has None
+            fault = None
             if name in seen:
                 fault = f"{name!r} is already in line {seen[name]}"
+            elif None in row:
+                fault = "has too many columns"
+            elif any("\0" in cell for cell in row.values() if cell):
+                fault = "contains a NUL character"
+            if fault is not None:
                 raise bad_lines_error("bad_table", source_name, [(reader.line_num, fault)])
             seen[name] = reader.line_num
-            if None in row:
-                raise bad_lines_error(
-                    "bad_table", source_name, [(reader.line_num, "has too many columns")]
-                )
-            if any("\0" in cell for cell in row.values() if cell):
-                raise bad_lines_error(
-                    "bad_table", source_name, [(reader.line_num, "contains a NUL character")]
-                )
             fields = {c: unescape_csv_text(row[c]) for c in CSV_COLUMNS if row.get(c)}
+            if separator == ";":
+                fields |= {c: fields[c].replace(",", ".") for c in NUMBER_COLUMNS if c in fields}
             entries.append(ManifestEntry(reader.line_num, name, fields))
         return entries
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InvalidRequest("bad_table", f"Can't read {source_name}: {error}") from error
+        raise InvalidRequest("bad_table", f"Can't read {source_name} as UTF-8: {error}") from error
 
 
 def read_jsonl_manifest(
@@ -410,7 +414,7 @@ def _as_form_text(field: str, value: Any) -> str:
         if not all(isinstance(tag, str) and "," not in tag for tag in value):
             raise ValueError("tags must be strings without commas")
         return _as_form_text(field, ",".join(value))
-    if field in ("latitude", "longitude", "altitude", "heading") and type(value) in (int, float):
+    if field in NUMBER_COLUMNS and type(value) in (int, float):
         return repr(value)
     raise ValueError(f"{field} can't be {json.dumps(value)[:50]}")
 

@@ -6,11 +6,12 @@ The server reads EXIF and XMP itself and uses them for every field that is not g
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import tempfile
 import unicodedata
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -25,8 +26,8 @@ from services.cli.ingest.local_headers import (
     read_sidecar,
 )
 from services.cli.ingest.photo_archive import is_archive, unpack_archive
-from services.cli.output import Json, utf8_path
-from shared.errors import InvalidRequest, PlacewiseError
+from services.cli.output import Json, print_note, printable_path, utf8_path
+from shared.errors import InvalidRequest
 from shared.geotagging.evidence import add_time_zones
 from shared.imaging.capture_place import is_null_island
 from shared.imaging.file_formats import PHOTO_SUFFIXES
@@ -91,17 +92,9 @@ class LocalSource:
 
 
 def count_other_files(folder: Path) -> Counter[str]:
-    """Count the files of a folder that are no photos by their suffix, such as `.mov`.
-
-    Hidden files are left out.
-    """
-    return Counter(
-        path.suffix.lower()
-        for path in folder.rglob("*")
-        if path.suffix.lower() not in PHOTO_SUFFIXES
-        and not _is_hidden(path, folder)
-        and path.is_file()
-    )
+    """Count the files of a folder that are no photos by suffix (`.mov`), without hidden ones."""
+    suffixes = (path.suffix.lower() for path in _list_files(folder))
+    return Counter(suffix for suffix in suffixes if suffix not in PHOTO_SUFFIXES)
 
 
 def find_photos(
@@ -128,11 +121,8 @@ def find_photos(
     """
     folder = source if source.is_dir() else source.parent
     found = [source] if source != folder else list_photos(folder)
-    own_fields, table_fields = {}, {}
-    if own_table is not None:
-        own_fields = _read_table(own_table.parent, own_table, set(found))
-    if table is not None:
-        table_fields = _read_table(folder, table, set(found))
+    own_fields = _read_table(own_table.parent, own_table, set(found)) if own_table else {}
+    table_fields = _read_table(folder, table, set(found)) if table else {}
     photos = []
     for path in found:
         fields = upload_fields_of_file_name(path.name, utm_zone)
@@ -174,12 +164,10 @@ def add_local_headers(
     zone = parse_time_zone(time_zone) if time_zone else None
     headers = []
     for photo in photos:
-        try:
-            with photo.path.open("rb") as file:
-                own = read_local_header(file)
-                whole = read_local_header(file, photo.sidecars.values()) if photo.sidecars else own
-        except (OSError, PlacewiseError):
-            own = whole = PhotoHeader(0, 0)  # its upload reports what is wrong with it
+        own = whole = PhotoHeader(0, 0)
+        with contextlib.suppress(OSError), photo.path.open("rb") as file:  # its upload reports it
+            own = read_local_header(file)
+            whole = read_local_header(file, photo.sidecars.values()) if photo.sidecars else own
         headers.append((own, whole))
     dated = add_time_zones(
         [dated_photo(str(number), whole) for number, (_, whole) in enumerate(headers)]
@@ -243,19 +231,13 @@ def read_photo_manifest(manifest: Path, data: bytes) -> list[LocalPhoto]:
 def list_photos(folder: Path) -> list[Path]:
     """List the photos below a folder, sorted; hidden files are left out.
 
+    Folders that can't be read are named on stderr.
+
     Raises:
         InvalidRequest: `no_photos` if there is none.
     """
-    paths = sorted(
-        (
-            path
-            for path in folder.rglob("*")
-            if path.is_file()
-            and path.suffix.lower() in PHOTO_SUFFIXES
-            and not _is_hidden(path, folder)
-        ),
-        key=_name_order,
-    )
+    files = _list_files(folder, _note_unreadable)
+    paths = sorted((p for p in files if p.suffix.lower() in PHOTO_SUFFIXES), key=_name_order)
     if not paths:
         raise InvalidRequest(
             "no_photos",
@@ -298,8 +280,15 @@ def _possible_paths(folder: Path, name: str) -> Iterator[Path]:
             yield folder / unicodedata.normalize(form, slashes)
 
 
-def _is_hidden(path: Path, folder: Path) -> bool:
-    return any(part.startswith(".") for part in path.relative_to(folder).parts)
+def _list_files(folder: Path, on_error: Callable[[OSError], None] | None = None) -> Iterator[Path]:
+    """Yield the files below a folder without hidden ones; links to folders are not followed."""
+    for parent, folders, names in os.walk(folder, onerror=on_error):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        yield from filter(Path.is_file, (Path(parent, n) for n in names if not n.startswith(".")))
+
+
+def _note_unreadable(error: OSError) -> None:
+    print_note(f"Can't read the folder {printable_path(Path(error.filename))}: {error.strerror}")
 
 
 def _name_order(path: Path) -> tuple[object, ...]:

@@ -243,9 +243,8 @@ def _print_report(report: Json, common: MapOptions, role: PhotoRole) -> None:
             "time is taken as UTC. Pass the zone: --time-zone +02:00 or --time-zone Europe/Paris."
         )
     if report.get("not_understood"):
-        number = len(report["not_understood"])
-        have = "photo has" if number == 1 else "photos have"
-        print_note(f"{number} {have} a GPS tag that could not be read:")
+        number = _count(len(report["not_understood"]), "photo")
+        print_note(f"{number} with a GPS tag that could not be read:")
         for item in report["not_understood"]:
             print_note(f"{printable_text(item['path'])}: {item['reason']}")
     print_failures(report, "refused", "failed")

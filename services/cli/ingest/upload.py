@@ -6,6 +6,7 @@ and for the vocabulary fit that the server starts if the map has enough photos.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import time
@@ -25,7 +26,7 @@ from placewise.protocol import printable_name
 from services.cli.client import wait_for_job
 from services.cli.ingest.geotags import LocalPhoto
 from services.cli.output import Json, print_note, utf8_path
-from shared.errors import Conflict, NotFound, PlacewiseError, Unprocessable
+from shared.errors import Conflict, NotFound, PlacewiseError, Unavailable, Unprocessable
 from shared.ingest.photo_metadata import KEY_FIELD
 
 UPLOAD_CONCURRENCY = 4
@@ -72,6 +73,9 @@ def upload_photos(
         Counts (`photos`, `uploaded`, `already_there`, `updated`, and `searchable` in the whole
         map), the `refused` and `failed` photos with reasons, the kind of the map's `vocabulary`,
         and the job of the vocabulary that was `fitted`, if any.
+
+    Raises:
+        Unavailable: The server was not reached, or had no space, for RETRY_PERIOD_SECONDS.
     """
     client.stats()  # fails early, and once, for a wrong URL, key or map
     counts: Counter[str] = Counter()
@@ -157,6 +161,9 @@ def _upload_concurrently(
         name = photo.name or printable_name(photo.path)
         try:
             send = partial(client.upload, photo.content(), filename=name, **fields)
+        except PlacewiseError as error:
+            return error
+        try:
             try:
                 return send()
             except Conflict as error:
@@ -164,6 +171,8 @@ def _upload_concurrently(
                     raise
                 client.patch_photo(error.extra["file_id"], **_patch_fields(photo.fields))
                 return send()
+        except Unavailable:  # of the server, for all photos
+            raise
         except PlacewiseError as error:
             return error
 
@@ -193,14 +202,11 @@ def _wait_for_jobs(
 ) -> None:
     """Wait until jobs end, and note those that fail."""
     for photo, job_id in pending:
-        try:
+        with contextlib.suppress(NotFound):  # the photo was deleted meanwhile
             job = wait_until_described(client, job_id)
-        except NotFound:  # the photo was deleted meanwhile
-            progress.advance(bar)
-            continue
+            if job.state != "succeeded":
+                failed.append(_photo_failure(photo, job.failure))
         progress.advance(bar)
-        if job.state != "succeeded":
-            failed.append(_photo_failure(photo, job.failure))
 
 
 def wait_until_described(client: Client, job_id: str | UUID) -> Job:
@@ -247,16 +253,15 @@ def wait_for_batch(client: Client, started: BatchStarted, progress: Progress) ->
     stats = client.stats()
     job.raise_for_failure()
     failed_items = list(client.batch_items(started, "failed", "cancelled"))
+    refused = [_item_failure(item) for item in failed_items if not item.file_id]
     counts = job.result or {}
     already_stored = counts.get("already_there", 0)
     return {
         "photos": job.progress.total,
-        "uploaded": job.progress.total
-        - already_stored
-        - sum(not item.file_id for item in failed_items),
+        "uploaded": job.progress.total - already_stored - len(refused),
         "already_there": already_stored,
-        "searchable": client.stats().searchable_images,
-        "refused": [_item_failure(item) for item in failed_items if not item.file_id],
+        "searchable": stats.searchable_images,
+        "refused": refused,
         "failed": [_item_failure(item) for item in failed_items if item.file_id],
         "vocabulary": stats.vocabulary,
         "fitted": fit,
@@ -268,16 +273,12 @@ def _wait_until_finished(
     client: Client, started: BatchStarted, progress: Progress, bar: TaskID
 ) -> Job:
     """Wait until a batch ends."""
-    reported = False
     for job in client.watch(started, poll_seconds=POLL_SECONDS):
         counts = job.progress
         progress.update(bar, completed=counts.done + counts.failed, total=counts.total or None)
-        if job.waiting_for and not reported:
+        if job.waiting_for:
             reason = job.waiting_for.replace("_", " ")
-            print_note(
-                f"The batch is waiting for {reason} on the server; it continues automatically."
-            )
-            reported = True
+            _note_once(f"The batch waits for {reason} on the server; it continues automatically.")
     return job
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,7 +10,10 @@ from rich.progress import Progress
 
 from placewise.answers import Job
 from placewise.client import Client
+from services.cli.ingest import upload
+from services.cli.ingest.geotags import LocalPhoto
 from services.cli.ingest.upload import wait_for_automatic_fit
+from shared.errors import StorageFull
 from tests.support.api_responses import JOB, STATS
 from tests.support.fake_server import running_server
 
@@ -26,6 +30,17 @@ def wait(
         job = wait_for_automatic_fit(client, Progress(disable=True))
         assert not server.answers
         return job, [method for method, _, _ in server.requests]
+
+
+def test_upload_to_a_full_disk_ends(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (photo := tmp_path / "a.jpg").write_bytes(b"a photo")
+    monkeypatch.setattr(upload, "RETRY_PERIOD_SECONDS", 0.0)
+    with running_server() as server, Client(server.url, patience_seconds=0) as client:
+        server.will_answer(200, STATS)
+        for _ in range(8):
+            server.will_answer(507, StorageFull("disk_full", "The disk is full.").as_problem())
+        with pytest.raises(StorageFull):
+            upload.upload_photos(client, [LocalPhoto(photo, {})] * 100, Progress(disable=True))
 
 
 def jobs(*listed: Any) -> dict[str, Any]:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from services.cli.recovery.backup import create_backup
 from services.search.chunk_loader import MappedFileCache
 from shared.catalog.database.schema import migrate
 from shared.catalog.database.session import Catalog
-from shared.config.embedded_home import announce_server, lock_home
+from shared.config.embedded_home import announce_server, find_running_server, lock_home
 from shared.config.private_files import create_private_file, make_private_folder, write_private
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
@@ -58,6 +60,22 @@ def test_home_catalog_and_marks_are_private(tmp_path: Path) -> None:
             }
             check_private(tmp_path / "deep")
         catalog.close()
+
+
+def test_server_that_starts_is_waited_for(tmp_path: Path) -> None:
+    with lock_home(tmp_path), ThreadPoolExecutor() as pool:
+        assert find_running_server(tmp_path) is None
+        found = pool.submit(lambda: find_running_server(tmp_path, 60))
+        assert wait([found], timeout=0.3).not_done
+        with announce_server(tmp_path, "http://localhost"):
+            assert getattr(found.result(), "url", None) == "http://localhost"
+
+
+def test_no_server_is_found_in_a_folder_of_another_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Path, "stat", Mock(side_effect=PermissionError))
+    assert find_running_server(tmp_path) is None
 
 
 @pytest.mark.usefixtures("no_umask")

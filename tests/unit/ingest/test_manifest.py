@@ -69,9 +69,7 @@ def test_a_bad_line_is_named_with_its_number(line: bytes, why: str) -> None:
 
 
 def test_an_invalid_value_in_a_manifest_fails_its_photo_only() -> None:
-    [reported] = read_jsonl_manifest(
-        b'{"file": "a", "latitude": 95, "longitude": 7}', "the manifest"
-    )
+    [reported] = read_jsonl_manifest(b'{"file": "a", "latitude": 95, "longitude": 7}', "a list")
     with pytest.raises(PlacewiseError, match="latitude"):
         read_form_fields(reported.fields)
 
@@ -94,6 +92,14 @@ def test_other_text_is_written_and_read_as_it_is() -> None:
         assert escape_csv_text(text) == text
     [entry] = read_csv_manifest(b"file,latitude,place\n'tis.jpg,-45,'s hall\n", "t")
     assert (entry.name, entry.fields) == ("'tis.jpg", {"latitude": "-45", "place": "'s hall"})
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_a_table_of_a_spreadsheet_may_have_its_separators_and_empty_rows(separator: str) -> None:
+    table = "filename,latitude,tags\r\na.jpg,45|5,x\r\n,,\r\n".replace(",", separator)
+    data = table.replace("|", "," if separator == ";" else ".").encode("utf-8-sig")
+    entry = ManifestEntry(2, "a.jpg", {"latitude": "45.5", "tags": "x"})
+    assert read_csv_manifest(data, "t") == [entry]
 
 
 @pytest.mark.parametrize(
