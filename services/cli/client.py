@@ -8,8 +8,8 @@ import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Annotated
 from functools import partial
+from typing import Annotated
 
 import typer
 from rich.progress import Progress
