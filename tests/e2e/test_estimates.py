@@ -130,7 +130,7 @@ def test_an_evaluation_lets_answers_say_whether_the_place_is_in_the_map(
 def test_an_estimate_uses_the_photos_with_a_place_and_counts_the_others(
     server: ServerProcess,
 ) -> None:
-    """Before each photo with coordinates lies one of the same view without any."""
+    """Before each photo with coordinates lies one of the same view without; another is alone."""
     numbers = [next(fresh) for _ in range(ENOUGH)]
     fill(server, "mixed", numbers, *({"latitude": n, "longitude": 7} for n in range(ENOUGH)))
     put(server, "mixed", [(photo_bytes(number, quality=51), {}) for number in numbers])
@@ -154,6 +154,12 @@ def test_an_estimate_uses_the_photos_with_a_place_and_counts_the_others(
         assert [m["match_probability"] is None for m in answer["similar_images"]] == [
             m["latitude"] is None for m in answer["similar_images"]
         ]
+
+    unknown = next(fresh)
+    put(server, "mixed", [(photo_bytes(unknown), {})])
+    for top_k in (1, 10):
+        answer = ask(server, "mixed", re_encoded(unknown), top_k=top_k)
+        assert answer["estimate"]["headline"].startswith("The photos that look like it have no")
 
 
 def test_a_filter_that_nothing_passes_gives_no_place_and_says_so(

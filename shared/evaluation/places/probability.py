@@ -222,6 +222,11 @@ class PlaceEstimate:
     match_probabilities: Sequence[float]
     """for each photo of the ranking: that it shows the query's place, at the finest level"""
 
+    @property
+    def is_probable(self) -> bool:
+        """Whether a level is the answer, or one that is smaller than the map is probable."""
+        return self.answer is not None or max(self.probabilities[:-1], default=0.0) >= 0.5
+
 
 class PlaceModel(BaseModel):
     """Probability model of the estimates of one map and generation. It is stored with it."""
@@ -326,6 +331,19 @@ class PlaceModel(BaseModel):
     def accepts(self, levels: Sequence[CandidateLevel]) -> bool | None:
         """Return `PlaceEstimate.in_map` of a query with these levels."""
         return self.is_in_map(self.probabilities(self.extent.end_levels(levels))[1])
+
+    def may_show(self, levels: Sequence[CandidateLevel], score: float, elsewhere: float) -> bool:
+        """Return whether a photo of the map whose place is not known may show that of a query.
+
+        Args:
+            levels: Those of the query's estimate, by the photos of known places.
+            score: Of the other photo.
+            elsewhere: As in `probabilities`.
+        """
+        finest = levels[0]
+        unmatched = finest.features[: len(FEATURES)]
+        as_best = replace(finest, best_score=score, features=unmatched)
+        return self.is_in_map(self.probabilities([as_best], elsewhere)[1]) is not False
 
     def threshold(self, certainty: float, guarantee: float | None = None) -> float:
         """Return how probable a level must be to be the answer.
