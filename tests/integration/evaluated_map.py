@@ -124,11 +124,10 @@ class EvaluatedMap:
 
 @dataclass(slots=True)
 class Watched:
-    """A search port that notes its searches, and has something done before the n-th one."""
+    """A search port that notes its searches, and has something done before the n-th (from 1)."""
 
     port: SearchBackend
     at: int | None = None
-    """counted from 1"""
     do: Callable[[], object] = lambda: None
     searches: list[SearchRequest] = field(default_factory=list)
 

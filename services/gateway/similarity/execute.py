@@ -393,10 +393,13 @@ def _estimate(
     similar = locate_hits(rankings.similar.hits[: search_params.top_k], rankings.similar.photos)
     if not any(ranked.location.is_known for ranked in similar):
         places = None  # the photos that it would be named after do not look like the query
-    if places is not None and model.is_fitted and not places.is_probable:
-        first = found.ranking[0]
-        if not first.location.is_known and model.may_show(places.levels, first.score, elsewhere):
-            places = None  # the map may show its place, and does not know where that is
+    elif (
+        places is not None
+        and model.is_fitted
+        and not found.ranking[0].location.is_known
+        and model.may_lack_place(places, found.ranking[0].score, elsewhere)
+    ):
+        places = None  # the map shows its place, and does not know where that is
     reason = _no_place_reason(found.hits, search_params.photos)
     is_new = places is not None and _is_new(search, model)
     estimate = estimate_place(places, certainty, elsewhere, reason, is_new=is_new)

@@ -332,18 +332,24 @@ class PlaceModel(BaseModel):
         """Return `PlaceEstimate.in_map` of a query with these levels."""
         return self.is_in_map(self.probabilities(self.extent.end_levels(levels))[1])
 
-    def may_show(self, levels: Sequence[CandidateLevel], score: float, elsewhere: float) -> bool:
-        """Return whether a photo of the map whose place is not known may show that of a query.
+    def may_lack_place(self, estimate: PlaceEstimate, score: float, elsewhere: float) -> bool:
+        """Return whether a photo of unknown place shows the query's place more probably than those
+        of an estimate do.
+
+        It leads the best of them by more than the first photo of a ranking does the last; or no
+        level is probable, and it is too similar for a photo of elsewhere.
 
         Args:
-            levels: Those of the query's estimate, by the photos of known places.
-            score: Of the other photo.
+            score: Of the photo.
             elsewhere: As in `probabilities`.
         """
-        finest = levels[0]
+        finest = estimate.levels[0]
+        if score - finest.best_score > (self.spread or math.inf):
+            return True
         unmatched = finest.features[: len(FEATURES)]
         as_best = replace(finest, best_score=score, features=unmatched)
-        return self.is_in_map(self.probabilities([as_best], elsewhere)[1]) is not False
+        _, not_in_map = self.probabilities([as_best], elsewhere)
+        return not estimate.is_probable and self.is_in_map(not_in_map) is not False
 
     def threshold(self, certainty: float, guarantee: float | None = None) -> float:
         """Return how probable a level must be to be the answer.
