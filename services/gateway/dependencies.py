@@ -40,7 +40,7 @@ from shared.storage import OwnedStore
 MAX_WAIT_SECONDS = 60.0  # of `Prefer: wait` and `?wait=`
 NOTIFIER_POLL_SECONDS = 0.02
 POLL_COST_DIVISOR = 2  # at most a third of the time is spent polling: slow polls become rare
-MAX_POLL_PAUSE_SECONDS = 1.0  # after a slow poll: the jobs of waiting requests may have ended
+MAX_POLL_PAUSE_SECONDS = 1.0  # the jobs of waiting requests may have ended
 WAITED_SHARE = 0.05  # of the time since the latest request began to wait, as a pause: jobs are long
 # Requests may wait this long after the shutdown has begun. Most queries end within this time.
 SHUTDOWN_WAIT_SECONDS = 5.0
@@ -93,19 +93,18 @@ class JobNotifier:
             self._waiters.discard(waiter)
 
     async def _poll_while_awaited(self) -> None:
-        pause, polled = NOTIFIER_POLL_SECONDS, 0.0
+        polled = cost = 0.0
         try:
             while self._waiters:
-                await asyncio.sleep(pause)
+                await asyncio.sleep(NOTIFIER_POLL_SECONDS)
                 started = time.monotonic()
-                waited = WAITED_SHARE * (started - self._latest_wait)
-                if started - polled < min(waited, MAX_POLL_PAUSE_SECONDS):
+                waited = started - self._latest_wait
+                pause = max(POLL_COST_DIVISOR * cost, WAITED_SHARE * waited)
+                if started - polled < min(pause, MAX_POLL_PAUSE_SECONDS):
                     continue
                 await self._poll(started)
                 polled = time.monotonic()
-                elapsed = polled - started
-                pause = min(POLL_COST_DIVISOR * elapsed, MAX_POLL_PAUSE_SECONDS)
-                pause = max(NOTIFIER_POLL_SECONDS, pause)
+                cost = polled - started
         finally:
             self._poll_task = None
 

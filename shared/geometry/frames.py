@@ -409,7 +409,9 @@ def _refine(
         np.linalg.inv(normal) * (unfitted * (1 + alike) / (1 - alike)),
         moved.mean(axis=0),
         math.sqrt(variance * bent),
-        bent and _rotation_deviation(moved[is_inlier, :2], residuals, variance * (1 - alike)),
+        _rotation_deviation(moved[is_inlier, :2], residuals, variance * (1 - alike))
+        if bent
+        else 0.0,
         knows_altitude,
     )
     return found, is_inlier

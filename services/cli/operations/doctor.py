@@ -45,11 +45,8 @@ def doctor(common: ServerOptions) -> None:
     # Imported here: the help does not need a database.
     from services.cli.operations.installation_checks import list_checks
 
-    running = (
-        RunningServer(common.server)
-        if common.server
-        else find_running_server(settings.placewise_home)
-    )
+    home = settings.placewise_home
+    running = RunningServer(common.server) if common.server else find_running_server(home)
     results = [
         _run_check(part, check, settings)
         for part, check in list_checks(settings, has_server=running is not None)
@@ -59,7 +56,7 @@ def doctor(common: ServerOptions) -> None:
     elif settings.database_url is not None:
         results.append(_CheckResult("server", True, "not checked: name the gateway, --server URL"))
     else:
-        start = command_line("serve", home=settings.placewise_home)
+        start = command_line("serve", home=home)
         results.append(_CheckResult("server", True, f"not running. Start it: {start}"))
     _print_results(results, common.as_json)
     if not all(result.ok for result in results):

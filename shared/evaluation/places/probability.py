@@ -346,10 +346,11 @@ class PlaceModel(BaseModel):
         finest = estimate.levels[0]
         if score - finest.best_score > (self.spread or math.inf):
             return True
+        if estimate.is_probable:
+            return False
         unmatched = finest.features[: len(FEATURES)]
         as_best = replace(finest, best_score=score, features=unmatched)
-        _, not_in_map = self.probabilities([as_best], elsewhere)
-        return not estimate.is_probable and self.is_in_map(not_in_map) is not False
+        return self.is_in_map(self.probabilities([as_best], elsewhere)[1]) is not False
 
     def threshold(self, certainty: float, guarantee: float | None = None) -> float:
         """Return how probable a level must be to be the answer.

@@ -177,10 +177,10 @@ def test_the_prior_orders_a_clear_and_an_unclear_ranking_and_answers_neither() -
     assert sure.not_in_map == unsure.not_in_map == ELSEWHERE_SHARE
     assert (sure.answer, unsure.answer) == (None, None)
     fitted = PlaceModel(source="own_photos", own_photos=20, spread=0.1)
-    told = fitted.estimate(clear, clear[1:], PATHS, 0.5, 25.0)
-    assert told is not None
-    assert told.answer == 0
-    leads = [fitted.may_lack_place(told, score, ELSEWHERE_SHARE) for score in (0.99, 1.01)]
+    answered = fitted.estimate(clear, clear[1:], PATHS, 0.5, 25.0)
+    assert answered is not None
+    assert answered.answer == 0
+    leads = [fitted.may_lack_place(answered, score, ELSEWHERE_SHARE) for score in (0.99, 1.01)]
     assert leads == [False, True], "a photo without a place leads by the spread"
 
 
