@@ -275,8 +275,8 @@ def unescape_csv_text(cell: str) -> str:
 def read_csv_manifest(data: bytes, source_name: str) -> list[ManifestEntry]:
     """Parse a CSV table with a column of names (NAME_COLUMNS) and any of CSV_COLUMNS.
 
-    Text may be as `escape_csv_text` writes it. Separators may be semicolons, with decimal commas,
-    or tabs, as spreadsheets write them. Errors name the table `source_name`.
+    Text may be as `escape_csv_text` writes it. Separators may be semicolons or tabs, with decimal
+    commas, as spreadsheets write them. Errors name the table `source_name`.
 
     Raises:
         InvalidRequest: `bad_table`.
@@ -285,7 +285,7 @@ def read_csv_manifest(data: bytes, source_name: str) -> list[ManifestEntry]:
         text = data.decode("utf-8-sig")
         separator = max(",;\t", key=text.partition("\n")[0].count)
         reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator)
-        columns = reader.fieldnames or []
+        reader.fieldnames = columns = [name.strip().lower() for name in reader.fieldnames or []]
         name_column = next((c for c in NAME_COLUMNS if c in columns), None)
         if name_column is None:
             raise InvalidRequest(
@@ -317,7 +317,7 @@ def read_csv_manifest(data: bytes, source_name: str) -> list[ManifestEntry]:
                 raise bad_lines_error("bad_table", source_name, [(reader.line_num, fault)])
             seen[name] = reader.line_num
             fields = {c: unescape_csv_text(row[c]) for c in CSV_COLUMNS if row.get(c)}
-            if separator == ";":
+            if separator != ",":
                 fields |= {c: fields[c].replace(",", ".") for c in NUMBER_COLUMNS if c in fields}
             entries.append(ManifestEntry(reader.line_num, name, fields))
         return entries
