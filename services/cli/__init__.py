@@ -9,6 +9,7 @@ every operation takes the same path. Commands that work on files alone (`describ
 import contextlib
 import gc
 import os
+import sys
 from collections.abc import Iterator
 
 
@@ -20,10 +21,13 @@ def main() -> None:
     # A start allocates a million objects that stay: collecting garbage every 700 of them takes a
     # fifth of the time that importing takes.
     gc.set_threshold(50_000, 20, 20)
-    # Imported here: decoding child processes re-import this script and must not load torch.
-    from services.cli.main import run
+    try:
+        # Imported here: decoding child processes re-import this script and must not load torch.
+        from services.cli.main import run
 
-    run()
+        run()
+    except KeyboardInterrupt:  # while commands are imported; later ones are reported by Typer
+        sys.exit(130)
 
 
 @contextlib.contextmanager
