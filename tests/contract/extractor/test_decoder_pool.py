@@ -247,6 +247,17 @@ def test_decoder_processes_import_no_torch_and_have_a_memory_limit(pool: Decoder
     assert limit == (2_000_000_000, 2_000_000_000)
 
 
+def test_decoder_processes_have_one_thread_however_many_processors_there_are(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The memory of NumPy's 64 threads would exceed the limit of a process."""
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    with pool_with(settings) as pool:
+        pool.decode([GOOD], SQUARE)
+        status = in_child(pool, "open('/proc/self/status').read()")
+    assert "Threads:\t1\n" in status
+
+
 def test_closing_the_pool_ends_its_processes(settings: Settings) -> None:
     with pool_with(settings) as pool:
         child = in_child(pool, "__import__('os').getpid()")
