@@ -9,7 +9,6 @@ reconstructions, which store their steps (`services.extractor.geometry.job`).
 from __future__ import annotations
 
 import contextlib
-import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -32,7 +31,7 @@ from shared.catalog.jobs import FIT_WORKER_JOBS
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.tables import open_catalog
 from shared.catalog.vocabularies import VocabularyOrigin, get_pca_source_generation
-from shared.config.settings import Settings
+from shared.config.settings import Settings, usable_processors
 from shared.descriptors.patches import fit_vocabulary, sample_photos
 from shared.descriptors.pca_fit import (
     check_pca_fittable,
@@ -142,7 +141,7 @@ def _read_rows(store: ObjectStore, request: PcaFitRequest) -> Iterator[Rows]:
 def _compute_in_this_process(request: FitRequest, settings: Settings, report: Report) -> Fitted:
     """Compute a fit with a catalog, a store and a model of its own."""
     # Half of the processors are left to queries and photos.
-    torch.set_num_threads(max(1, (os.cpu_count() or 1) // 2))
+    torch.set_num_threads(max(1, usable_processors() // 2))
     settings = settings.model_copy(update={"decode_processes": 1})
     with contextlib.ExitStack() as stack:
         catalog = stack.enter_context(contextlib.closing(open_catalog(settings, "fit")))

@@ -20,7 +20,7 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.generations import Generation
 from shared.catalog.models import Model, get_model_for_loading, get_or_create_model
 from shared.catalog.vocabularies import StoredWhitening, Vocabulary
-from shared.config.settings import Settings
+from shared.config.settings import Settings, usable_processors
 from shared.descriptors.backbones import Backbone
 from shared.descriptors.extractor import Extractor, choose_device, spec_fingerprint
 from shared.descriptors.inference import (
@@ -80,6 +80,8 @@ class ModelRegistry:
         self._settings = settings
         self._lock = threading.RLock()
         self._device = choose_device(settings.device)
+        # PyTorch does not know a container's limit, and waits for threads that may not run.
+        torch.set_num_threads(min(torch.get_num_threads(), usable_processors()))
         self._extractors: LRUCache[str, Extractor] = LRUCache(MAX_EXTRACTORS)
         # Extractors with the same local features share a backbone.
         self._backbones: WeakValueDictionary[object, Backbone] = WeakValueDictionary()

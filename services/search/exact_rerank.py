@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from services.search.chunk_loader import LoadedChunk
 from services.search.kernels import row_products
+from shared.config.settings import usable_processors
 
 Addresses = NDArray[np.uint64]
 Indices = NDArray[np.int64]
@@ -88,7 +88,7 @@ def parallel_for(run_range: Callable[[int, int], None], rows: int, bytes_each: i
         rows: Number of rows.
         bytes_each: Bytes of work for each row, which determine the number of parts.
     """
-    parts = min(_cpu_count(), rows * bytes_each // MIN_PART_BYTES)
+    parts = min(_processors(), rows * bytes_each // MIN_PART_BYTES)
     if parts <= 1:
         run_range(0, rows)
         return
@@ -99,15 +99,12 @@ def parallel_for(run_range: Callable[[int, int], None], rows: int, bytes_each: i
         other.result()
 
 
-@cache
-def _cpu_count() -> int:
-    """Number of CPUs that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+_processors = cache(usable_processors)
 
 
 @cache
 def _thread_pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max(1, _cpu_count() - 1), "search-part")
+    return ThreadPoolExecutor(max(1, _processors() - 1), "search-part")
 
 
 # Minimum number of rows compared exactly between two checks of the floor. A step is

@@ -8,6 +8,7 @@ bytes). Sizes may have a unit: `100MB`. `SECRET_SETTINGS` may also be read from 
 
 from __future__ import annotations
 
+import contextlib
 import os
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -39,16 +40,25 @@ SECRET_SETTINGS = (
 
 GPU_BATCH_PHOTOS = 64  # more at once are hardly faster: docs/how-to/throughput.md
 CGROUP_MEMORY_LIMIT_FILE = Path("/sys/fs/cgroup/memory.max")
+CGROUP_CPU_LIMIT_FILE = Path("/sys/fs/cgroup/cpu.max")  # microseconds in each period of so many
 
 
 def memory_limit_bytes() -> int:
     """Return the memory that this process may use: the machine's, or the container's limit."""
     machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    try:
-        limit = CGROUP_MEMORY_LIMIT_FILE.read_text().strip()
-    except OSError:
-        return machine
-    return min(machine, int(limit)) if limit.isdigit() else machine  # "max" means no limit
+    with contextlib.suppress(OSError, ValueError):  # no cgroups; "max" means no limit
+        return min(machine, int(CGROUP_MEMORY_LIMIT_FILE.read_text()))
+    return machine
+
+
+def usable_processors() -> int:
+    """Return how many processors this process may use: the machine's, or the container's limit."""
+    has_affinity = hasattr(os, "sched_getaffinity")  # not macOS
+    machine = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
+    with contextlib.suppress(OSError, ValueError):
+        limit, period = map(int, CGROUP_CPU_LIMIT_FILE.read_text().split())
+        return max(1, min(machine, limit // period))
+    return machine
 
 
 class ServiceSettings(BaseSettings):
@@ -174,7 +184,7 @@ class Settings(
 
     def for_device(self, device: str) -> Self:
         """Return the settings of an extractor on `cpu` or `cuda`, which decides what is unset."""
-        processors = len(os.sched_getaffinity(0))
+        processors = usable_processors()
         decoders = processors - 2 if device == "cuda" else processors // 4
         decoders = max(decoders, 2) * (1 if self.s3_endpoint is None else 2)
         chosen = {"decode_processes": min(decoders, MAX_DECODE_PROCESSES)}

@@ -9,7 +9,8 @@ import pytest
 from pydantic import SecretStr, ValidationError
 
 from services.cli.environment import is_secret, read_settings
-from shared.config.settings import SECRET_SETTINGS, Settings
+from shared.config import settings as settings_module
+from shared.config.settings import SECRET_SETTINGS, Settings, usable_processors
 from shared.errors import Conflict, Misconfigured
 from shared.storage.s3 import Bucket
 
@@ -39,6 +40,22 @@ def test_batches_and_decoders_follow_from_the_device_unless_they_are_set(
     monkeypatch.setenv("DECODE_PROCESSES", "3")
     kept = Settings().for_device(device)
     assert (kept.batch_photos, kept.decode_processes) == (7, 3)
+
+
+def test_processors_are_those_of_the_container_and_counted_on_every_system(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    limit = tmp_path / "cpu.max"
+    monkeypatch.setattr(settings_module, "CGROUP_CPU_LIMIT_FILE", limit)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(6)))
+    assert usable_processors() == 6
+    for written, expected in (("max 100000\n", 6), ("250000 100000\n", 2), ("5000 100000\n", 1)):
+        limit.write_text(written)
+        assert usable_processors() == expected
+    limit.unlink()
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    monkeypatch.delattr(os, "sched_getaffinity")  # as on macOS
+    assert usable_processors() == 8
 
 
 def test_home_is_absolute_wherever_the_process_goes(
