@@ -227,18 +227,15 @@ AdmissionDep = Annotated[AdmissionControl, Depends(_get_admission_control)]
 
 
 def _admit_job(request: Request) -> None:
-    admission: AdmissionControl = request.app.state.admission
-    admission.admit_job(get_map_name(request))
+    request.app.state.admission.admit_job(get_map_name(request))
 
 
 def _admit_query(request: Request) -> None:
-    admission: AdmissionControl = request.app.state.admission
-    admission.admit_query()
+    request.app.state.admission.admit_query()
 
 
 def _check_disk(request: Request) -> None:
-    admission: AdmissionControl = request.app.state.admission
-    admission.disk.check()
+    request.app.state.admission.disk.check()
 
 
 async def _check_photo_quota(request: Request) -> None:

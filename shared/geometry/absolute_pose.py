@@ -98,7 +98,8 @@ def estimate_absolute_pose(
             fits.append(_Fit(pixels, points, covariances, tried, found.R, position))
     refined = sorted(fits, key=lambda fit: fit.cost)[:REFINED_STARTS]
     weights = np.zeros(PARAMETERS)
-    weights[6] = _prior(focal_sigma)
+    sigma = UNKNOWN_FOCAL_SIGMA if focal_sigma is None else max(focal_sigma, 1e-6)
+    weights[6] = sigma**-2
     if lens is not None:
         weights[7:9] = (lens.principal_point * WORKING_SIDE) ** -2
         weights[9] = lens.radial**-2
@@ -252,8 +253,3 @@ class _Fit:
             errors = np.einsum("mij,mj->mi", whitening, errors)
         weights = 1 / (1 + np.sum(errors**2, axis=1) / LOSS_SCALE_PIXELS**2)
         return rows, errors, weights
-
-
-def _prior(focal_sigma: float | None) -> float:
-    """Return the weight of the focal length that is known."""
-    return (UNKNOWN_FOCAL_SIGMA if focal_sigma is None else max(focal_sigma, 1e-6)) ** -2

@@ -204,7 +204,8 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
         print_json({"moved": moved, "held": hold is not None, **_as_dict(count)})
         return
     print_message(f"{count.objects} objects, {count.orphans.total()} of them orphaned")
-    _print_orphans(count)
+    for prefix, number in sorted(count.orphans.items()):
+        print_message(f"  {prefix:14} {number:8}  {count.orphan_bytes[prefix] / 1e6:10.1f} MB")
     if confirm:
         print_message(
             f"Moved {moved} objects to the trash. They are deleted after "
@@ -246,8 +247,3 @@ def _as_dict(count: StoreCount) -> dict[str, Any]:
         for prefix, number in sorted(count.orphans.items())
     }
     return {"objects": count.objects, "unknown": unknown}
-
-
-def _print_orphans(count: StoreCount) -> None:
-    for prefix, number in sorted(count.orphans.items()):
-        print_message(f"  {prefix:14} {number:8}  {count.orphan_bytes[prefix] / 1e6:10.1f} MB")

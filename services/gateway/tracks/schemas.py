@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
+from functools import partial
 from typing import Annotated, Any, Literal, Self
 from uuid import UUID
 
@@ -47,16 +48,12 @@ class TrackParams(RequestModel):
         return DEFAULT_MOTION if motion is None else motion_model(motion)
 
 
-def _parse_captured_at(text: Any) -> datetime:
-    return parse_time("captured_at", str(text))
-
-
 class FrameForm(BaseModel):
     """The text fields of a frame's form. Position and odometry are stored as JSON with it."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    captured_at: Annotated[datetime, BeforeValidator(_parse_captured_at)] = Field(
+    captured_at: Annotated[datetime, BeforeValidator(partial(parse_time, "captured_at"))] = Field(
         description="when the photo was taken, ISO 8601; no offset means UTC; unique in a track"
     )
     expected_version: int | None = Field(

@@ -80,7 +80,6 @@ class MultipartFormParser:
         self._parser = MultipartParser(
             _parse_boundary(request),
             {
-                "on_part_begin": self._on_part_begin,
                 "on_header_field": self._on_header_field,
                 "on_header_value": self._on_header_value,
                 "on_header_end": self._on_header_end,
@@ -110,9 +109,6 @@ class MultipartFormParser:
         if not self._ended:
             raise _malformed_body_error("the body ends before the last boundary")
 
-    def _on_part_begin(self) -> None:
-        self._disposition = b""
-
     def _on_header_field(self, data: bytes, start: int, end: int) -> None:
         self._header_name += data[start:end]
 
@@ -126,6 +122,7 @@ class MultipartFormParser:
 
     def _on_headers_finished(self) -> None:
         _, options = parse_options_header(self._disposition)
+        self._disposition = b""
         name = options.get(b"name", b"").decode("utf-8", "replace")
         if not name:
             raise _malformed_body_error("a part has no name")
