@@ -17,6 +17,7 @@ import hashlib
 import logging
 import os
 import shutil
+import sqlite3
 import time
 from collections.abc import Iterator
 from functools import cache
@@ -37,6 +38,7 @@ log = logging.getLogger(__name__)
 
 MIGRATIONS = Path(__file__).parent.parent / "migrations"
 MIN_POSTGRES_VERSION = (14,)
+MIN_SQLITE_VERSION = (3, 35)  # RETURNING, MATERIALIZED
 ADVISORY_LOCK_ID = 1886151011  # "plac" in ASCII
 
 # Only other processes that create the tables are waited for.
@@ -52,7 +54,7 @@ def migrate(catalog: Catalog) -> None:
     Raises:
         Unavailable: `catalog_unavailable`, or `catalog_busy` if another process does not finish.
         Misconfigured: As `opening` raises, for an SQLite file that can't be used; `schema_differs`;
-            `postgres_too_old`.
+            `postgres_too_old`, `sqlite_too_old`.
     """
     try:
         if catalog.is_sqlite:
@@ -154,6 +156,13 @@ def _is_current(catalog: Catalog, connection: Connection) -> bool:
 
 def _migrate_sqlite(catalog: Catalog) -> None:
     """Create the tables in one transaction, which excludes every other process."""
+    if sqlite3.sqlite_version_info < MIN_SQLITE_VERSION:
+        raise Misconfigured(
+            "sqlite_too_old",
+            f"This Python has SQLite {sqlite3.sqlite_version}; 3.35 or newer is required. Use "
+            "another Python (rm -r .venv; make run PYTHON=python3.12), or set DATABASE_URL to a "
+            "PostgreSQL.",
+        )
     if catalog.url.database:
         file = Path(catalog.url.database)
         make_private_folder(file.parent)

@@ -130,6 +130,14 @@ def test_a_postgresql_that_is_too_old_is_refused_before_anything_is_created(
     catalog.close()
 
 
+def test_an_sqlite_that_is_too_old_is_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(sqlite3, "sqlite_version_info", (3, 34, 1))  # of Red Hat Enterprise Linux 9
+    with pytest.raises(Misconfigured, match=r"3\.35 or newer is required"):
+        migrate(Catalog(f"sqlite:///{tmp_path / 'catalog.sqlite'}"))
+
+
 @pytest.mark.parametrize("command", ["serve", "doctor"])
 def test_a_command_on_a_damaged_catalog_ends_with_a_sentence(file: Path, command: str) -> None:
     no_sqlite(file)
