@@ -23,6 +23,7 @@ from placewise.protocol import (
     OnWait,
     RetryPolicy,
     drop_none,
+    may_use_proxy,
     open_file,
     printable_name,
     response_error,
@@ -70,6 +71,7 @@ class AsyncTransport:
         self._patience = RetryPolicy(patience_seconds)
         self._open(
             base_url=self.url,
+            trust_env=may_use_proxy(self.url),
             timeout=timeout_seconds,
             params={"map": map} if map else None,
             headers={"Authorization": f"Bearer {key}"} if key else None,

@@ -87,6 +87,11 @@ def validate_url(url: str, key: str | None) -> str:
     )
 
 
+def may_use_proxy(url: str) -> bool:
+    """Return False for this machine, which no proxy that the environment names can reach."""
+    return httpx2.URL(url).host not in ("127.0.0.1", "::1", "localhost")
+
+
 def response_error(response: httpx2.Response) -> PlacewiseError:
     """Convert an error response to a PlacewiseError."""
     error = error_from_response(response.status_code, response.text)

@@ -59,7 +59,8 @@ class HttpSearchClient:
     def __init__(self, urls: Sequence[str], timeout_seconds: float) -> None:
         self._timeout_seconds = timeout_seconds
         self._http = httpx2.Client(
-            limits=httpx2.Limits(max_keepalive_connections=MAX_KEPT_CONNECTIONS)
+            limits=httpx2.Limits(max_keepalive_connections=MAX_KEPT_CONNECTIONS),
+            trust_env=False,  # a proxy that the environment names is for other networks
         )
         self._workers = WorkerDirectory(urls, partial(fetch_status, self._http))
         self._stop = threading.Event()

@@ -14,7 +14,7 @@ from typing import Any
 
 import httpx2
 
-from placewise.protocol import Json, RetryPolicy, response_error, validate_url
+from placewise.protocol import Json, RetryPolicy, may_use_proxy, response_error, validate_url
 from shared.errors import NotFound, PlacewiseError, TooManyRequests, Unavailable, Unprocessable
 
 TIMEOUT_SECONDS = 60.0
@@ -35,7 +35,10 @@ class ImmichApi:
     def __init__(self, url: str, key: str) -> None:
         self.url = validate_url(url, key).removesuffix("/api")
         self._http = httpx2.Client(
-            base_url=f"{self.url}/api", headers={"x-api-key": key}, timeout=TIMEOUT_SECONDS
+            base_url=f"{self.url}/api",
+            trust_env=may_use_proxy(self.url),
+            headers={"x-api-key": key},
+            timeout=TIMEOUT_SECONDS,
         )
         self._retries = RetryPolicy(RETRY_PERIOD_SECONDS)
         self._next_write = 0.0

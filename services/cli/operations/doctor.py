@@ -10,7 +10,7 @@ import httpx2
 import typer
 from rich.markup import escape
 
-from placewise.protocol import response_error
+from placewise.protocol import may_use_proxy, response_error
 from services.cli.client import ServerOptions
 from services.cli.environment import read_settings
 from services.cli.output import console, print_json
@@ -70,6 +70,7 @@ def _read_health(url: str, key: str | None) -> list[_CheckResult]:
             f"{url.rstrip('/')}/api/v1/health",
             headers={"Authorization": f"Bearer {key}"} if key else {},
             timeout=HEALTH_TIMEOUT_SECONDS,
+            trust_env=may_use_proxy(url),
         )
     except httpx2.HTTPError as error:
         detail = f"{url} does not answer ({type(error).__name__}). Check the URL."

@@ -29,7 +29,9 @@ class TestSearchOverHttp(SearchPortContract):
         catalog: Catalog,
         store: FolderStore,
         settings: Settings,
+        monkeypatch: pytest.MonkeyPatch,
     ) -> Iterator[OpenPort]:
+        monkeypatch.setenv("ALL_PROXY", "http://127.0.0.1:1")  # not between services
         with contextlib.ExitStack() as running:
 
             def open_port(max_wait_seconds: float = MAX_WAIT_SECONDS) -> SearchBackend:

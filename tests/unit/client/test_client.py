@@ -100,6 +100,15 @@ def test_key_that_no_header_can_carry_is_refused(server: FakeServer) -> None:
         assert key not in caught.value.detail
 
 
+def test_proxies_of_the_environment_are_not_asked_for_this_machine(
+    server: FakeServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ALL_PROXY", "http://127.0.0.1:1")
+    server.will_answer(200, STATS)
+    with Client(server.url, patience_seconds=0) as client:
+        assert client.stats()
+
+
 @pytest.mark.parametrize(
     "url", ["host:8", "http://", "http://[::1", "http://a:1:2", "http://a/?b=c"]
 )
