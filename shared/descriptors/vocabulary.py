@@ -103,7 +103,9 @@ def parse_centres(array: NDArray[np.float32], *, width: int | None = None) -> Cl
 
 def encode_centres(centres: ClusterCentres) -> bytes:
     """Encode the centres as a `.npy` file."""
-    return _encode_array(centres.array)
+    buffer = io.BytesIO()
+    np.save(buffer, centres.array, allow_pickle=False)
+    return buffer.getvalue()
 
 
 def decode_centres(data: bytes, *, width: int | None = None) -> ClusterCentres:
@@ -119,12 +121,6 @@ def decode_centres(data: bytes, *, width: int | None = None) -> ClusterCentres:
             "This is not a NumPy .npy file of cluster centres, or it is truncated.",
         ) from error
     return parse_centres(array, width=width)
-
-
-def _encode_array(array: NDArray[Any]) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, array, allow_pickle=False)
-    return buffer.getvalue()
 
 
 def decode_array(data: bytes) -> NDArray[Any]:

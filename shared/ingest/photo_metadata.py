@@ -69,11 +69,12 @@ def read_form_fields(form: dict[str, str]) -> PhotoFields:
     latitude, longitude = coordinate_pair(
         _number(values, "latitude", -90, 90), _number(values, "longitude", -180, 180)
     )
+    heading = _number(values, "heading", 0, 360)
     return PhotoFields(
         latitude=latitude,
         longitude=longitude,
         altitude=_number(values, "altitude", -MAX_ALTITUDE_M, MAX_ALTITUDE_M),
-        heading=_heading(values),
+        heading=None if heading is None else heading % 360,
         captured_at=parse_time("captured_at", values["captured_at"])
         if "captured_at" in values
         else None,
@@ -159,11 +160,6 @@ def _number(values: dict[str, str], field: str, minimum: float, maximum: float) 
             field, f"{values[field]} is not between {minimum:g} and {maximum:g}"
         )
     return number
-
-
-def _heading(values: dict[str, str]) -> float | None:
-    heading = _number(values, "heading", 0, 360)
-    return None if heading is None else heading % 360
 
 
 def _text(field: str, text: str) -> str:
