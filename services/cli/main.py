@@ -168,9 +168,7 @@ def _build_overview() -> typer.Typer:
 
 def run() -> None:
     """Parse the command line and run the command."""
-    logging.basicConfig(
-        level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
-    )
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     names = sys.argv[1:2]
     if sys.argv[1:] in ([], ["--help"], ["--version"]):
         app = _build_overview()

@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import logging
 import re
+import time
 from datetime import UTC, datetime
 from typing import Any
 
@@ -88,8 +89,12 @@ class _JsonFormatter(logging.Formatter):
 class _TextFormatter(logging.Formatter):
     """Formats a record for people, with the request id and the `extra` values at the end.
 
-    The lines of a traceback are indented, so that no text of an error can look like a log line.
+    Times are UTC. The lines of a traceback are indented, so that no text of an error can look like
+    a log line.
     """
+
+    converter = time.gmtime  # type: ignore[assignment]
+    default_time_format, default_msec_format = "%Y-%m-%dT%H:%M:%S", "%s.%03dZ"
 
     def __init__(self) -> None:
         super().__init__(TEXT_FORMAT)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
+import time
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
 
 import pytest
 
@@ -70,13 +72,21 @@ def test_json_lines_hold_message_logger_and_request_id(
     assert "ValueError: why" in lines[3]["error"]
 
 
-def test_text_lines_end_with_the_fields(set_up: Set, capsys: pytest.CaptureFixture[str]) -> None:
+def test_text_lines_begin_with_the_time_in_utc_and_end_with_the_fields(
+    set_up: Set, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     set_up()
-    with request_id_context("r-1"):
-        logging.getLogger("services.gateway").info("stored", extra={"status": 202})
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setenv("TZ", "Asia/Kolkata")
+        time.tzset()
+        with request_id_context("r-1"):
+            logging.getLogger("services.gateway").info("stored", extra={"status": 202})
+    time.tzset()
     logging.getLogger("services.gateway").debug("only with DEBUG")
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.endswith("INFO services.gateway: stored status=202 request_id=r-1")
+    stamp, _, text = line.partition(" ")
+    assert text == "INFO services.gateway: stored status=202 request_id=r-1"
+    assert abs(datetime.fromisoformat(stamp) - datetime.now(UTC)) < timedelta(minutes=1)
     set_up(DEBUG="true")
     logging.getLogger("services.gateway").debug("only with DEBUG")
     assert "only with DEBUG" in capsys.readouterr().err
