@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -104,3 +105,16 @@ def test_an_image_holds_no_lab_and_its_commands_say_so(image: BuildImage, tmp_pa
     code = f"from services.cli import main; {LAB_COMMAND}"
     said = run_python(image("gateway"), tmp_path, code, exits=1)
     assert "lab_missing: `placewise train` is part of the lab" in " ".join(said.split())
+
+
+@pytest.mark.parametrize("python", ["3.12", "3.13", "3.14"])
+def test_a_later_python_finds_all_packages(python: str, tmp_path: Path) -> None:
+    """As `make setup` installs them, on Linux with an x86-64 processor."""
+    uv = str(Path(sys.executable).with_name("uv"))
+    where = ("--python-platform", "x86_64-manylinux_2_34", "--python-version", python)
+    packages = ("--constraint", "requirements.lock", "--requirement", "pyproject.toml")
+    install = ("pip", "install", "--dry-run", "--all-extras", "--target", tmp_path)
+    done = subprocess.run(
+        [uv, *install, *where, *packages], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-1500:]
