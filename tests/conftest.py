@@ -38,6 +38,7 @@ from tests.support.servers import (
     start_redis,
     start_s3,
 )
+from tests.support.shared_tls import share_tls_context
 from tests.support.spare_databases import SpareDatabases
 
 FORKED_WORKERS = pytest.StashKey[bool]()
@@ -55,6 +56,7 @@ COMPUTING = ("integration", "contract", "unit")
 # the CPU time of tests of the gateway.
 gc.set_threshold(50_000)
 share_compiled_statements()
+share_tls_context()
 hypothesis.settings.register_profile("any processor", deadline=None)
 hypothesis.settings.load_profile("any processor")
 # Imports freeze their objects, of which triton would report hundreds as leaked at the end.

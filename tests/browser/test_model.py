@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 from playwright.sync_api import Route, expect
 
 from tests.browser.conftest import MAP, CityServer, Visitor
-from tests.support.exported import SIDE, onnx_of, tiny_network
+from tests.support.exported import SIDE, tiny_onnx
 
 
 def test_a_vocabulary_is_fitted_with_a_bar_and_compared_with_the_one_before(
@@ -193,14 +192,11 @@ def test_a_new_map_is_created_and_selected(visitor: Visitor, city: CityServer) -
     assert "old-city" in [one["name"] for one in city.server.client.get("/api/v1/maps").json()]
 
 
-def test_added_models_are_listed_and_can_be_switched_to(
-    visitor: Visitor, city: CityServer, tmp_path: Path
-) -> None:
-    file = onnx_of(tiny_network(), tmp_path)
+def test_added_models_are_listed_and_can_be_switched_to(visitor: Visitor, city: CityServer) -> None:
     options = f"input.size={SIDE}x{SIDE}"
     form = {"name": "tiny", "licence": "MIT", "options": options}
     started = city.server.client.post(
-        "/api/v1/models", data=form, files={"file": ("net.onnx", file)}
+        "/api/v1/models", data=form, files={"file": ("net.onnx", tiny_onnx())}
     )
     finished = city.server.finished(started.json()["job_id"])
     assert finished["state"] == "succeeded", finished

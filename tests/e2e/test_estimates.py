@@ -12,9 +12,8 @@ from tests.support.problems import got
 from tests.support.server import ServerProcess
 
 SETTINGS = {"auto_evaluate_photos": 0}
-ENOUGH = 60  # to tell one in twenty
-ASKED = range(0, ENOUGH, 3)
-MANY = 60  # more than an estimate looks at
+ENOUGH = 60  # to tell one in twenty, and more than an estimate looks at
+ASKED = range(0, ENOUGH, 9)
 fresh = itertools.count(9000)
 
 
@@ -100,7 +99,7 @@ def test_an_evaluation_lets_answers_say_whether_the_place_is_in_the_map(
         assert estimate["headline"].startswith("In this map" if level["whole_map"] else "Here")
         assert (estimate["radius_m"], estimate["place"]) == (level["radius_m"], None)
         assert estimate["confidence"] == level["probability"]
-    outside = [photo_bytes(next(fresh)) for _ in range(20)]
+    outside = [photo_bytes(next(fresh)) for _ in range(8)]
     estimates_outside = [
         ask(server, "streets", photo, elsewhere=0.9)["estimate"] for photo in outside
     ]
@@ -109,13 +108,13 @@ def test_an_evaluation_lets_answers_say_whether_the_place_is_in_the_map(
         for photo, estimate in zip(outside, estimates_outside, strict=True)
         if estimate["in_map"] is False
     ]
-    assert len(refused) >= 14
-    for photo, estimate in refused:
+    assert len(refused) >= 5
+    for _, estimate in refused:
         assert (estimate["latitude"], estimate["place"], estimate["radius_m"]) == (None,) * 3
         assert estimate["headline"].startswith("Probably not in this map")
-        filtered = {"near": "3,7,1", "history": False, "elsewhere": 0.9}
-        narrow = ask(server, "streets", photo, **filtered)["estimate"]
-        assert narrow["in_map"] is False, "however narrow the filter"
+    filtered = {"near": "3,7,1", "history": False, "elsewhere": 0.9}
+    narrow = ask(server, "streets", refused[0][0], **filtered)["estimate"]
+    assert narrow["in_map"] is False, "however narrow the filter"
     assert got(server.client.get("/api/v1/maps/streets"))["measurement"] == "measured"
     ask(server, "streets", re_encoded(streets[3]), history=False)
     history = got(server.client.get("/api/v1/searches", params={"map": "streets", "limit": 100}))[
@@ -173,21 +172,22 @@ def test_a_filter_that_nothing_passes_gives_no_place_and_says_so(
     assert sorted(found["latitude"] for found in narrowed["similar_images"]) == [5, 6]
 
 
-def test_more_photos_than_an_estimate_looks_at_are_answered(server: ServerProcess) -> None:
-    numbers = [next(fresh) for _ in range(MANY)]
-    fill(server, "many", numbers, *({} for _ in numbers))
-    everything = ask(server, "many", re_encoded(numbers[0]), top_k=100)
+def test_more_photos_than_an_estimate_looks_at_are_answered(
+    server: ServerProcess, streets: list[int]
+) -> None:
+    everything = ask(server, "streets", re_encoded(streets[0]), top_k=100)
     scores = [found["similarity_score"] for found in everything["similar_images"]]
-    assert len(scores) == MANY
+    assert len(scores) == ENOUGH
     assert scores == sorted(scores, reverse=True)
-    for top_k in (1, 49, 50, 51, 57):
-        answer = ask(server, "many", re_encoded(numbers[0]), top_k=top_k)
+    for top_k in (1, 50, 51):
+        answer = ask(server, "streets", re_encoded(streets[0]), top_k=top_k)
         shown = [found["image_id"] for found in answer["similar_images"]]
         assert shown == [found["image_id"] for found in everything["similar_images"]][:top_k]
     for rank in (5, 55):
         bound = (scores[rank - 1] + scores[rank]) / 2
-        answer = ask(server, "many", re_encoded(numbers[0]), top_k=100, min_score=bound)
+        answer = ask(server, "streets", re_encoded(streets[0]), top_k=100, min_score=bound)
         assert answer["total_similar"] == rank
-    none = ask(server, "many", photo_bytes(next(fresh)), min_score=1)
+    fill(server, "unplaced", [next(fresh)], {})
+    none = ask(server, "unplaced", photo_bytes(next(fresh)), min_score=1)
     assert none["similar_images"] == []
     assert "look like it have no coordinates" in none["estimate"]["reason"]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from http.server import ThreadingHTTPServer
@@ -30,9 +29,6 @@ class FilesServer:
     """What a path's hash is taken of instead of its content."""
     break_after: list[int] = field(default_factory=list)
     """Bytes after which the next answers break off, each once."""
-    stall_after: int | None = None
-    """Bytes after which an answer stands still until `go_on` is set."""
-    go_on: threading.Event = field(default_factory=threading.Event)
     ranges: bool = True
     """Whether it has strong ETags and sends parts."""
     refuse: list[int] = field(default_factory=list)
@@ -92,14 +88,7 @@ class _Handler(QuietHandler):
             self.close_connection = True
             self.connection.shutdown(2)
             return
-        if shown.stall_after is not None:
-            self.wfile.write(data[begin : begin + shown.stall_after])
-            self.wfile.flush()
-            begin += shown.stall_after
-            shown.go_on.wait()
-        # The client may be dead by now.
-        with contextlib.suppress(ConnectionError):
-            self.wfile.write(data[begin:])
+        self.wfile.write(data[begin:])
 
 
 @contextlib.contextmanager
@@ -109,7 +98,4 @@ def files_server() -> Iterator[FilesServer]:
         shown = FilesServer(url=f"http://127.0.0.1:{server.server_port}")
         server.shown = shown  # type: ignore[attr-defined]
         with serving(server):
-            try:
-                yield shown
-            finally:
-                shown.go_on.set()
+            yield shown

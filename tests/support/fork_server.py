@@ -27,6 +27,7 @@ import services.cli
 from services.cli import collection_paused
 from services.search.sign_code_search import compile_kernels
 from shared.config.settings import Settings
+from tests.support.shared_tls import share_tls_context
 from tools.make_api_page import openapi_description
 
 # Beside the command's own modules: what they import when they run. A module that is missing here is
@@ -170,6 +171,7 @@ def _import() -> None:
     configure_mappers()
     openapi_description()  # works out all routes
     compile_kernels()
+    share_tls_context()
 
 
 def main() -> None:

@@ -80,17 +80,6 @@ def clone(origin: Path, tmp_path: Path) -> Clone:
     return Clone(origin, tmp_path / "clone")
 
 
-def test_a_capability_raises_the_limit_first_and_adds_its_lines_later(clone: Clone) -> None:
-    clone.raise_limit(10)
-    clone.add_record()
-    run_git(clone.folder, "add", "--all")
-    assert clone.check() == ""
-    clone.commit()
-    clone.add_lines(10)
-    clone.commit()
-    assert clone.check() == ""
-
-
 def test_the_pre_commit_hook_refuses_a_commit_above_a_limit(clone: Clone) -> None:
     (clone.folder / ".venv").symlink_to(sys.prefix)
     subprocess.run((f"{sys.prefix}/bin/pre-commit", "install"), cwd=clone.folder, check=True)
@@ -138,13 +127,16 @@ def test_a_raise_that_later_commits_follow_is_examined(clone: Clone) -> None:
     assert "without adding a decision record" in clone.check()
 
 
-def test_a_merge_brings_the_raise_and_the_lines_of_its_branch(clone: Clone) -> None:
+def test_a_capability_raises_the_limit_adds_its_lines_later_and_is_merged(clone: Clone) -> None:
     run_git(clone.folder, "checkout", "--quiet", "-b", "capability")
     clone.raise_limit(10)
     clone.add_record()
+    run_git(clone.folder, "add", "--all")
+    assert clone.check() == ""
     clone.commit()
     clone.add_lines(10)
     clone.commit()
+    assert clone.check() == ""
     run_git(clone.folder, "checkout", "--quiet", "-")
     run_git(clone.folder, "merge", "--quiet", "--no-ff", "--no-commit", "capability")
     assert clone.check() == ""

@@ -6,7 +6,6 @@ import hashlib
 import io
 import os
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 from uuid import UUID
 
@@ -44,8 +43,8 @@ from tests.support.exported import (
     PATCH_WIDTH,
     SIDE,
     code_name,
-    onnx_of,
     tiny_network,
+    tiny_onnx,
     tiny_torchscript,
 )
 from tests.support.photos import photo_bytes
@@ -424,10 +423,8 @@ def test_torchscript_code_runs_only_where_its_hash_is_allowed(
     failed(allowing, send_exported(allowing, other, "net.pt", "other"), "code_not_allowed")
 
 
-def test_an_exported_network_is_listed_used_kept_and_removed(
-    allowing: Service, tmp_path: Path
-) -> None:
-    data = onnx_of(tiny_network(), tmp_path)
+def test_an_exported_network_is_listed_used_kept_and_removed(allowing: Service) -> None:
+    data = tiny_onnx()
     extractor = allowing.done(send_exported(allowing, data, "net.onnx"))["extractor"]
     (body,) = allowing.json("GET", "/models")["models"]
     assert (body["name"], body["extractor"]) == ("tiny", extractor)
@@ -455,11 +452,9 @@ def test_an_exported_network_is_listed_used_kept_and_removed(
     allowing.json("DELETE", "/models/tiny")
 
 
-def test_patches_of_an_exported_network_get_a_vocabulary_of_the_map(
-    allowing: Service, tmp_path: Path
-) -> None:
+def test_patches_of_an_exported_network_get_a_vocabulary_of_the_map(allowing: Service) -> None:
     options = f"aggregator=vlad,clusters=4,{SIZE}"
-    data = onnx_of(tiny_network(patches=True), tmp_path)
+    data = tiny_onnx(patches=True)
     started = send_exported(allowing, data, "net.onnx", "town", options)
     extractor = allowing.done(started)["extractor"]
     allowing.json("POST", "/maps", 201, json={"name": "town", "extractor": extractor})

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.exported import SIDE, onnx_of, tiny_network
+from tests.support.exported import SIDE, tiny_onnx
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.server import CommandLine, ServerProcess
 
@@ -41,7 +41,7 @@ def test_extractors_are_compared_on_a_map_with_the_command_that_switches_to_the_
 ) -> None:
     placewise = CommandLine(tmp_path, town.home)
     file = tmp_path / "net.onnx"
-    file.write_bytes(onnx_of(tiny_network(), tmp_path))
+    file.write_bytes(tiny_onnx())
     placewise("models", "add", file, "--name", "tiny", "--options", NETWORK, "--json").json()
     own = f"onnx:{file}:{NETWORK}"
     command = ("compare", "--map", "default", "--extractor", own)

@@ -108,8 +108,17 @@ def test_weights_that_the_setting_names_are_listed_where_they_fit(
 # --- fetch: DINOv2 ---------------------------------------------------------------------------
 
 
-def test_weights_are_fetched_ahead_of_time(server: FilesServer, vits_weights: bytes) -> None:
+def test_weights_are_fetched_ahead_of_time_and_from_where_an_earlier_fetch_ended(
+    server: FilesServer, vits_weights: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server.break_after = [3_000_000]
+    with monkeypatch.context() as once:
+        once.setattr(weight_files, "MAX_DOWNLOAD_ATTEMPTS", 1)
+        run("models", "fetch", VITS, code=1)
+    server.requests.clear()
     fetched = models("fetch", VITS)
+    # huggingface_hub asks for more than files.
+    assert [part for path, part in server.requests if path == VITS_FILE] == ["bytes=3000000-"]
     assert Path(fetched["path"]).read_bytes() == vits_weights
     assert (fetched["available"], fetched["dimension"]) == (True, 64 * 384)
     count = len(server.requests)

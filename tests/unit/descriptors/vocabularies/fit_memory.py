@@ -1,7 +1,4 @@
-"""A process that fits vocabularies to patches as ViT-S makes them, and prints the memory it took:
-
-python -m tests.unit.descriptors.vocabularies.fit_memory PHOTOS...
-"""
+"""A program that fits vocabularies to patches as ViT-S makes them, and prints its memory."""
 
 from __future__ import annotations
 
@@ -14,8 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from shared.descriptors import patches
 from shared.descriptors.extractor import Extractor
-from shared.descriptors.patches import fit_vocabulary
 from shared.extractor_config.configs import get_extractor_config
 from tests.support.memory import memory_bytes
 from tests.unit.descriptors.vocabularies.points import clustered_points
@@ -53,6 +50,7 @@ class ManyPatches:
 
 def main(counts: list[int]) -> None:
     torch.set_num_threads(1)
+    patches.PATCHES_BYTES //= 4
     before = memory_bytes("VmRSS")
     print(json.dumps({"before": before, "fits": [fit(photos) for photos in counts]}))
 
@@ -61,7 +59,7 @@ def fit(photos: int) -> dict[str, int]:
     config = get_extractor_config("anyloc-vits14", allow_test_extractors=False)
     backbone: Any = ManyPatches()
     extractor = Extractor(config, torch.device("cpu"), backbone=backbone)
-    fitted = fit_vocabulary(extractor, batches(photos), photos, clusters=CLUSTERS, seed=0)
+    fitted = patches.fit_vocabulary(extractor, batches(photos), photos, clusters=CLUSTERS, seed=0)
     return {
         "peak": memory_bytes("VmHWM"),  # of all fits so far
         "photos": fitted.provenance["photos"],
