@@ -166,7 +166,7 @@ def _limits() -> Iterator[None]:
     except MemoryError:
         raise PassFailed(f"it needs more than {MEMORY_BYTES / 1e9:g} GB of memory") from None
     except Exception as error:  # ONNX Runtime's own types have no other base
-        raise PassFailed(str(error)) from None
+        raise PassFailed(" ".join(str(error).split())) from None
     finally:
         signal.alarm(0)
 

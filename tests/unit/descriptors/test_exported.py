@@ -179,7 +179,7 @@ def test_photos_keep_their_size_for_a_network_that_takes_any(tmp_path: Path) -> 
     [
         (f"onnx:x:aggregator=vlad,{SIZE}", "descriptors", "(2, 24)"),
         (f"onnx:x:{SIZE}", "patches", "(2, 6, 4, 4)"),
-        ("onnx:x", "descriptors", "224"),
+        ("onnx:x", "descriptors", "Got: 224 Expected: 64"),
     ],
 )
 def test_an_output_of_another_shape_is_refused_with_what_was_expected(
@@ -262,6 +262,7 @@ def test_a_network_of_a_fixed_batch_or_another_device_is_refused_with_the_cause(
     name = f"torchscript:x:{SIZE}"
     assert "takes batches of 4 only" in refusal(name, torchscript_of(FixedBatch()))
     assert "names the device cuda:7" in refusal(name, torchscript_of(FixedDevice()))
+    assert "shapes cannot be multiplied" in refusal("torchscript:x", tiny_torchscript())
 
 
 def test_an_onnx_file_that_names_other_files_is_refused_with_how_to_save_it_as_one(
