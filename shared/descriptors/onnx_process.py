@@ -12,10 +12,10 @@ import multiprocessing
 import os
 import resource
 import signal
-import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import TimeoutError as TimedOut
 from concurrent.futures import wait
+from multiprocessing.util import Finalize
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -80,7 +80,7 @@ class OnnxProcess:
             initializer=_prepare,
             initargs=[data, threads],
         )
-        weakref.finalize(self, _end, self._pool)
+        Finalize(self, _end, [self._pool], exitpriority=0)  # atexit does not run in children
 
     def open(self) -> None:
         """Open the file; raises as a pass does."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import multiprocessing
 import re
 import sys
 import time
@@ -46,6 +47,7 @@ pytestmark = pytest.mark.numerics
 CPU = torch.device("cpu")
 SIZE = f"input.size={SIDE}x{SIDE}"
 PHOTOS = probe_photos(SIDE, SIDE)
+OPEN: list[ExportedBackbone] = []
 
 
 @pytest.fixture(scope="module")
@@ -311,6 +313,21 @@ def test_an_onnx_file_that_asks_for_more_memory_than_it_may_have_is_refused() ->
 def test_an_onnx_file_with_operators_of_its_own_is_refused() -> None:
     own = helper.make_node("Steal", ["x"], ["y"], domain="org.example")
     assert "can't be read" in refusal(f"onnx:x:{SIZE}", operators([own]))
+
+
+def keep_open(data: bytes) -> None:
+    OPEN.append(backbone(f"onnx:x:{SIZE}", data))
+
+
+def test_a_process_with_an_open_onnx_network_ends(tiny_onnx: Callable[[bool], bytes]) -> None:
+    process = multiprocessing.get_context("spawn").Process(
+        target=keep_open, args=[tiny_onnx(False)]
+    )
+    process.start()
+    process.join(90)
+    is_alive = process.is_alive()
+    process.kill()
+    assert not is_alive
 
 
 def test_a_file_that_was_replaced_describes_with_another_spec(tmp_path: Path) -> None:
