@@ -12,10 +12,10 @@ import multiprocessing
 import os
 import resource
 import signal
-import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import TimeoutError as TimedOut
 from concurrent.futures import wait
+from multiprocessing.util import Finalize
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -80,7 +80,7 @@ class OnnxProcess:
             initializer=_prepare,
             initargs=[data, threads],
         )
-        weakref.finalize(self, _end, self._pool)
+        Finalize(self, _end, [self._pool], exitpriority=0)  # atexit does not run in children
 
     def open(self) -> None:
         """Open the file; raises as a pass does."""
@@ -166,7 +166,7 @@ def _limits() -> Iterator[None]:
     except MemoryError:
         raise PassFailed(f"it needs more than {MEMORY_BYTES / 1e9:g} GB of memory") from None
     except Exception as error:  # ONNX Runtime's own types have no other base
-        raise PassFailed(str(error)) from None
+        raise PassFailed(" ".join(str(error).split())) from None
     finally:
         signal.alarm(0)
 

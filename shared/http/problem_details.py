@@ -105,18 +105,18 @@ def problem_response(error: PlacewiseError, request: Request) -> JSONResponse:
 
 async def _handle_placewise_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, PlacewiseError)
-    if error.status >= 500:
-        log.error("%s %s: %s", request.method, request.url.path, error.detail)
-    else:
-        log.debug("%s %s: %s", request.method, request.url.path, error.detail)
+    level = logging.ERROR if error.status >= 500 else logging.DEBUG
+    log.log(level, "%s %s: %s", request.method, request.url.path, error.detail)
     return problem_response(error, request)
 
 
 async def _handle_validation_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
     failures = error.errors()
-    if any(failure["type"] == "json_invalid" for failure in failures):
-        problem: PlacewiseError = InvalidRequest("malformed_body", "The body is not valid JSON.")
+    if any(f["type"] == "json_invalid" or isinstance(f.get("input"), bytes) for f in failures):
+        problem: PlacewiseError = InvalidRequest(
+            "malformed_body", "The body is not valid JSON with `Content-Type: application/json`."
+        )
     else:
         errors = [
             {

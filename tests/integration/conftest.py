@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 from uuid import UUID
 
@@ -92,14 +90,6 @@ def service(
     with catalog.write() as session:
         get_or_create_default_map(session, settings.extractor)
     return Service(catalog, store, settings, make_worker)
-
-
-@pytest.fixture
-def sqlite_catalog(migrated_sqlite: Path, tmp_path: Path) -> Iterator[Catalog]:
-    """An empty catalog for tests of what is the same whatever the database."""
-    opened = Catalog(f"sqlite:///{shutil.copy(migrated_sqlite, tmp_path)}")
-    yield opened
-    opened.close()
 
 
 @pytest.fixture

@@ -84,7 +84,7 @@ def restore_backup(
         raise store_taken_error(store, "belongs to another catalog than this one")
     unknown_key = next((i.key for i in list_backup_objects(store) if i.key not in index), None)
     if unknown_key is not None:
-        raise _not_empty_error(f"the object store has {unknown_key!r}, which is not in the backup")
+        raise _not_empty_error(f"The object store has {unknown_key!r}, which is not in the backup.")
     try:
         begin_rebuild(catalog, store, UUID(mark or manifest.installation_id))
     except Conflict as error:
@@ -97,9 +97,8 @@ def restore_backup(
 def _not_empty_error(reason: str) -> Conflict:
     return Conflict(
         "target_not_empty",
-        f"A backup can only be restored into an empty Placewise, and this one is not: {reason}. "
-        "Set another PLACEWISE_HOME, or a new database (DATABASE_URL) and an empty bucket "
-        "(S3_BUCKET).",
+        "A backup can only be restored into an empty Placewise. Set another PLACEWISE_HOME, or a "
+        f"new database (DATABASE_URL) and an empty bucket (S3_BUCKET). {reason}",
     )
 
 

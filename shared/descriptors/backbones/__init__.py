@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch.nn.functional import normalize
 
-from shared.descriptors.weight_files import OnProgress, first_error_line
+from shared.descriptors.weight_files import OnProgress
 from shared.errors import PlacewiseError
 from shared.extractor_config.configs import MAX_WIDTH, ExtractorConfig
 from shared.extractor_config.names import NetworkInput
@@ -139,9 +139,10 @@ class NetworkBackbone(Backbone):
         except PlacewiseError:
             raise
         except Exception as error:  # networks of others may raise anything
+            reason = (str(error).strip() or "no message").splitlines()[-1]  # after a traceback
             raise ValueError(
                 f"with 2 photos of {height} x {width} pixels it fails with "
-                f"{type(error).__name__}: {first_error_line(error)}"
+                f"{type(error).__name__}: {reason}"
             ) from error
 
 

@@ -9,13 +9,10 @@ from typing import Any
 import pytest
 
 from shared.catalog.database.base import db_now
-from shared.catalog.database.session import Catalog
 from shared.catalog.maps import get_map
 from shared.catalog.models import Model
-from shared.config.settings import Settings
 from shared.geometry.colmap_model import MAX_PHOTOS
 from shared.ids import new_id
-from shared.storage import FolderStore
 from tests.integration.api_with_keys import ADMIN, Door
 from tests.support.problems import problem
 from tools.make_api_page import openapi_description
@@ -25,11 +22,6 @@ PHOTO = "/uploads/01a1fca4-c1a2-7356-bf32-75e1cb64beb1"
 BOUNDED_FORMATS = {"binary", "date-time", "duration", "uuid"}
 CAMERA = {"model": "PINHOLE", "width": 9, "height": 9, "params": [9, 9, 4, 4]}
 POSE = {"camera": 0, "rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}
-
-
-@pytest.fixture
-def door(sqlite_catalog: Catalog, store: FolderStore, settings: Settings) -> Door:
-    return Door(sqlite_catalog, store, settings)
 
 
 def unbounded(schema: dict[str, Any], path: str, schemas: dict[str, Any]) -> Iterator[str]:
@@ -101,6 +93,11 @@ def test_a_body_of_more_values_than_its_size_needs_is_refused_before_it_is_parse
     for body in (b"[" * 70_000, b'{"tags":[' + b"1," * 70_000 + b"1]}", b"{}," * 40_000):
         answer = door(ADMIN, "PATCH", PHOTO, content=body)
         problem(answer, 413, "too_many_values")
+
+
+def test_a_body_without_its_content_type_is_refused_with_the_header_to_send(door: Door) -> None:
+    refused = problem(door(ADMIN, "PATCH", PHOTO, content=b"{}"), 400, "malformed_body")
+    assert "`Content-Type: application/json`" in refused["detail"]
 
 
 def test_the_largest_model_that_is_allowed_can_be_imported(door: Door) -> None:

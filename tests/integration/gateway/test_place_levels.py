@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from PIL import Image
 
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
 from shared.evaluation.places.probability import PlaceModel
 from shared.search_api.protocol import SearchRequest, SearchResponse
 from tests.integration.in_process_api import Service
-from tests.support.photos import photo_bytes
+from tests.support.photos import encoded, photo_bytes
 from tests.support.problems import problem
 
 PATHS = ("tower/7/lift", "tower/7/hall", "tower/8/lift", "tower//attic", "tower", "a")
@@ -55,6 +56,16 @@ def test_a_map_without_an_evaluation_states_no_certainty(service: Service) -> No
         assert estimate["reason"].startswith("How certain this place is, and whether it is in")
         assert estimate["place"] == "room 0"
         assert answer["similar_images"][0]["match_probability"] is None
+
+
+def test_a_photo_of_one_colour_is_not_answered_as_if_the_map_were_empty(service: Service) -> None:
+    service.json("POST", "/maps", 201, json={"name": "small", "extractor": "patchnorm"})
+    service.upload(photo_bytes(0), "small")
+    job_id = service.ask(encoded(Image.new("RGB", (64, 48), "grey"), "PNG"), "small")
+    service.drain()
+    answer = service.json("GET", f"/jobs/{job_id}/result", params={"map": "small"})
+    assert answer["similar_images"] == []
+    assert "this one has no structure" in answer["estimate"]["reason"]
 
 
 def test_the_levels_of_a_path_are_listed_finest_first_and_ever_more_probable(

@@ -5,20 +5,10 @@ from __future__ import annotations
 import re
 from uuid import UUID
 
-import pytest
-
-from shared.catalog.database.session import Catalog
-from shared.config.settings import Settings
-from shared.storage import FolderStore
 from tests.integration.api_with_keys import ADMIN, Door
 from tools.make_api_page import openapi_description
 
 API = "/api/v1"
-
-
-@pytest.fixture
-def door(sqlite_catalog: Catalog, store: FolderStore, settings: Settings) -> Door:
-    return Door(sqlite_catalog, store, settings)
 
 
 def test_every_endpoint_refuses_an_unknown_parameter_by_its_name(door: Door) -> None:

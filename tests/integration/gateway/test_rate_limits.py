@@ -51,12 +51,6 @@ def settings_of_counts(
 
 
 @pytest.fixture
-def catalog(sqlite_catalog: Catalog) -> Catalog:
-    """Of one kind: nothing here is the catalog's."""
-    return sqlite_catalog
-
-
-@pytest.fixture
 def limited(catalog: Catalog, store: FolderStore, settings_of_counts: Settings) -> Door:
     return Door(catalog, store, settings_of_counts)
 

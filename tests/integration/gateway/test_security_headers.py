@@ -30,12 +30,6 @@ class Broken:
         raise RuntimeError(f"/srv/secret/place.py: {name}")
 
 
-@pytest.fixture
-def catalog(sqlite_catalog: Catalog) -> Catalog:
-    """Of one kind: nothing here is the catalog's."""
-    return sqlite_catalog
-
-
 def client_of(catalog: Catalog, store: FolderStore, settings: Settings, search: Any) -> TestClient:
     with catalog.write() as session:
         get_or_create_default_map(session, settings.extractor)

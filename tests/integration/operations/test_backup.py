@@ -373,7 +373,7 @@ def test_only_an_empty_placewise_is_restored_into(
     service.indexed(1)
     back_up()
     folder = BackupFolder(tmp_path / "backup")
-    with pytest.raises(Conflict) as caught:
+    with pytest.raises(Conflict, match=r"PLACEWISE_HOME.*this one has") as caught:
         restore_backup(folder, service.catalog, service.store, service.settings)
     assert caught.value.code == "target_not_empty"
     other_store.put("vocabularies/another", b"centres")

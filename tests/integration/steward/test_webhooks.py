@@ -440,11 +440,12 @@ def test_a_deleted_webhook_gets_nothing_more(hooks: WebhookSetup) -> None:
     )
 
 
+@pytest.mark.databases("sqlite")
 @pytest.mark.parametrize("url", ["https://localhost/", "https://no-such-name.invalid/"])
 def test_a_webhook_to_a_private_or_unresolvable_host_is_refused(
-    sqlite_catalog: Catalog, store: FolderStore, url: str
+    catalog: Catalog, store: FolderStore, url: str
 ) -> None:
-    door = Door(sqlite_catalog, store, Settings())
+    door = Door(catalog, store, Settings())
     params = {"url": url, "events": ["job.failed"]}
     field_refused(door(ADMIN, "POST", "/webhooks", json=params), "url")
     assert door(ADMIN, "GET", "/webhooks").json() == []

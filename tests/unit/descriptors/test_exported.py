@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import multiprocessing
 import re
 import sys
 import time
@@ -47,6 +48,7 @@ pytestmark = pytest.mark.numerics
 CPU = torch.device("cpu")
 SIZE = f"input.size={SIDE}x{SIDE}"
 PHOTOS = probe_photos(SIDE, SIDE)
+OPEN: list[ExportedBackbone] = []
 
 
 def config_of(name: str) -> Any:
@@ -166,7 +168,7 @@ def test_photos_keep_their_size_for_a_network_that_takes_any(tmp_path: Path) -> 
     [
         (f"onnx:x:aggregator=vlad,{SIZE}", "descriptors", "(2, 24)"),
         (f"onnx:x:{SIZE}", "patches", "(2, 6, 4, 4)"),
-        ("onnx:x", "descriptors", "224"),
+        ("onnx:x", "descriptors", "Got: 224 Expected: 64"),
     ],
 )
 def test_an_output_of_another_shape_is_refused_with_what_was_expected(
@@ -235,6 +237,7 @@ def test_a_network_of_a_fixed_batch_or_another_device_is_refused_with_the_cause(
     name = f"torchscript:x:{SIZE}"
     assert "takes batches of 4 only" in refusal(name, torchscript_of(FixedBatch()))
     assert "names the device cuda:7" in refusal(name, torchscript_of(FixedDevice()))
+    assert "shapes cannot be multiplied" in refusal("torchscript:x", tiny_torchscript())
 
 
 def test_an_onnx_file_that_names_other_files_is_refused_with_how_to_save_it_as_one(
@@ -286,6 +289,21 @@ def test_an_onnx_file_that_asks_for_more_memory_than_it_may_have_is_refused() ->
 def test_an_onnx_file_with_operators_of_its_own_is_refused() -> None:
     own = helper.make_node("Steal", ["x"], ["y"], domain="org.example")
     assert "can't be read" in refusal(f"onnx:x:{SIZE}", onnx_file([own]))
+
+
+def keep_open(data: bytes) -> None:
+    OPEN.append(backbone(f"onnx:x:{SIZE}", data))
+
+
+def test_a_process_with_an_open_onnx_network_ends(tiny_onnx: Callable[[bool], bytes]) -> None:
+    process = multiprocessing.get_context("spawn").Process(
+        target=keep_open, args=[tiny_onnx(False)]
+    )
+    process.start()
+    process.join(90)
+    is_alive = process.is_alive()
+    process.kill()
+    assert not is_alive
 
 
 def test_a_file_that_was_replaced_describes_with_another_spec(tmp_path: Path) -> None:
