@@ -131,7 +131,7 @@ def query(
             str(rank),
             f"{match.similarity_score:.4f}",
             *([format_percent(match.match_probability)] if levels else []),
-            *([_format_count(match.inliers)] if answer.matches else []),
+            *(["" if match.inliers is None else str(match.inliers)] if answer.matches else []),
             escape(match.relative_path or match.original_filename),
             _format_degrees(match.latitude),
             _format_degrees(match.longitude),
@@ -178,10 +178,6 @@ def _pose_table(pose: CameraPose) -> Table:
         "focal length", f"{camera.focal_pixels:.0f} of {camera.width} px, {camera.source}"
     )
     return table
-
-
-def _format_count(value: int | None) -> str:
-    return "" if value is None else str(value)
 
 
 def _format_matches(matches: Matches) -> str:

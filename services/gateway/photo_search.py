@@ -154,7 +154,8 @@ def search_photos(
     time = Photo.captured_at if query.sort == "taken" else Photo.uploaded_at
     newest = (time.desc(), Photo.id.desc())
     if after is not None:
-        live.append(tuple_(time, Photo.id) < tuple_(*_cursor_bound(after)))
+        bound = tuple_(literal(after[0], UtcDateTime()), literal(after[1], Uuid()))
+        live.append(tuple_(time, Photo.id) < bound)
     page: Select[Photo]
     if total < MAX_COUNTED_MATCHES:
         rare = select(Photo.id).where(*conditions).cte("rare")
@@ -194,7 +195,3 @@ def _box_conditions(box: Box, photo: type[Photo]) -> list[Condition]:
 
 def _longitude_conditions(box: Box, photo: type[Photo]) -> list[Condition]:
     return [photo.longitude.between(west, east) for west, east in box.longitude_ranges()]
-
-
-def _cursor_bound(after: tuple[datetime, UUID]) -> tuple[object, object]:
-    return literal(after[0], UtcDateTime()), literal(after[1], Uuid())

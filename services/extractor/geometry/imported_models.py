@@ -148,7 +148,8 @@ def _turned_model(
             continue
         key = image.camera_id, photo.quarter_turns, photo.camera
         camera = turned_camera(pycolmap, image.camera, photo.quarter_turns)
-        if not _has_shape(photo, camera):
+        shape = camera.width / camera.height * photo.height / photo.width
+        if abs(shape - 1) >= 0.01:
             continue
         if key not in camera_ids:
             camera.camera_id = camera_ids[key] = len(camera_ids) + 1
@@ -197,7 +198,3 @@ def turned_camera(pycolmap: Any, camera: Any, quarter_turns: int) -> Any:
             values[x], values[y] = _turn(quarter_turns) @ [values[x], values[y]]
     turned.params = [values[name] for name in names]
     return turned
-
-
-def _has_shape(photo: PhotoToMap, camera: Any) -> bool:
-    return bool(abs(camera.width / camera.height * photo.height / photo.width - 1) < 0.01)

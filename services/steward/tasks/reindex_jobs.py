@@ -134,10 +134,6 @@ def _find_missing(session: Session, generation_id: UUID, photo_ids: Sequence[UUI
     return missing
 
 
-def _photos_of_chunk(chunk_id: UUID) -> Select[UUID]:
-    return select(Descriptor.photo_id).where(Descriptor.chunk_id == chunk_id)
-
-
 def _photos_of_cancelled_jobs(generation_id: UUID) -> Select[UUID]:
     """Select the photos whose reindex jobs were cancelled: they may be missing again."""
     return (
@@ -160,7 +156,8 @@ def _photo_sources(session: Session, map_id: UUID) -> dict[UUID, Select[UUID]]:
     active = active_generation(session, map_id)
     assert active is not None, "a generation is built only while another is active"
     live = select(Chunk.id).where(Chunk.generation_id == active.id, Chunk.superseded_at.is_(None))
-    chunks = {chunk_id: _photos_of_chunk(chunk_id) for chunk_id in session.scalars(live)}
+    photos = select(Descriptor.photo_id)
+    chunks = {each: photos.where(Descriptor.chunk_id == each) for each in session.scalars(live)}
     return {active.id: select_failed_photos(map_id), **chunks}
 
 
