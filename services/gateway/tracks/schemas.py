@@ -47,16 +47,14 @@ class TrackParams(RequestModel):
         return DEFAULT_MOTION if motion is None else motion_model(motion)
 
 
-def _parse_captured_at(text: Any) -> datetime:
-    return parse_time("captured_at", str(text))
-
-
 class FrameForm(BaseModel):
     """The text fields of a frame's form. Position and odometry are stored as JSON with it."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    captured_at: Annotated[datetime, BeforeValidator(_parse_captured_at)] = Field(
+    captured_at: Annotated[
+        datetime, BeforeValidator(lambda text: parse_time("captured_at", str(text)))
+    ] = Field(
         description="when the photo was taken, ISO 8601; no offset means UTC; unique in a track"
     )
     expected_version: int | None = Field(
