@@ -21,6 +21,7 @@ from placewise.protocol import (
     open_file,
     printable_name,
     to_jsonl,
+    to_text,
 )
 from shared.errors import Unavailable, Unprocessable
 
@@ -50,8 +51,7 @@ class AsyncClient(AsyncTransport):
             TooLarge: The file exceeds the server's limit.
             Unprocessable: A field or the image is invalid.
         """
-        data = {name: str(value) for name, value in drop_none(**fields).items()}
-        return answers.Uploaded(**await self._send_file("/upload", photo, filename, data=data))
+        return answers.Uploaded(**await self._send_file("/upload", photo, filename, fields))
 
     async def upload_files(
         self, photos: Sequence[str | Path], manifest: Sequence[Json] = ()
@@ -130,7 +130,7 @@ class AsyncClient(AsyncTransport):
                 polls the job instead.
             filters: `near` ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`,
                 `captured_before`, `place`, `place_under`, `tags`, `tags_like` and `ids`
-                (comma-separated); `certainty` is the share of answers that must be right;
+                (lists or comma-separated); `certainty` is the share of answers that must be right;
                 `guarantee` instead that of all queries that may get a wrong answer;
                 `elsewhere` the share of queries that are from elsewhere than the map;
                 `history=False` leaves the search out of the search history.
@@ -144,7 +144,7 @@ class AsyncClient(AsyncTransport):
                 explain=explain or None,
                 pose=pose or None,
                 focal_length=focal_length,
-                **filters,
+                **to_text(**filters),
             ),
             "headers": {"Prefer": f"wait={wait_seconds}"},
         }
@@ -207,8 +207,8 @@ class AsyncClient(AsyncTransport):
         self,
         /,
         track_id: Id,
-        photo: str | Path,
-        captured_at: datetime,
+        photo: str | Path | BinaryIO,
+        captured_at: datetime | str,
         *,
         wait: bool = True,
         expected_version: int | None = None,
@@ -217,7 +217,8 @@ class AsyncClient(AsyncTransport):
         """Add a frame to a track. The photo is not stored in the map.
 
         Args:
-            captured_at: When it was taken; unique in the track.
+            captured_at: When it was taken, or that in ISO 8601; unique in the track. Without an
+                offset it is UTC.
             wait: Wait for the state; False returns as soon as the frame is stored.
             expected_version: Version that the track must have, such as `version` of the frame
                 before.
@@ -229,13 +230,10 @@ class AsyncClient(AsyncTransport):
             Conflict: `track_changed`, `frame_differs`, `frame_too_late` or `track_full`.
             Unprocessable: A field or the image is invalid.
         """
-        fields = drop_none(
-            captured_at=captured_at.isoformat(), expected_version=expected_version, **measured
-        )
         answer = await self._send_file(
             f"/tracks/{track_id}/frames",
             photo,
-            data={name: str(value) for name, value in fields.items()},
+            fields={"captured_at": captured_at, "expected_version": expected_version, **measured},
             headers={"Prefer": f"wait={POLL_SECONDS:g}"} if wait else {},
         )
         frame = answers.TrackFrame(**answer)
@@ -345,7 +343,7 @@ class AsyncClient(AsyncTransport):
 
     def photos(self, /, **filters: Any) -> AsyncIterator[answers.Photo]:
         """Iterate over photos by metadata, newest first; for filters see `GET /search`."""
-        return self._iterate(answers.Photo, "/search", "images", **filters)
+        return self._iterate(answers.Photo, "/search", "images", **to_text(**filters))
 
     async def patch_photo(self, /, file_id: Id, **fields: Any) -> answers.OnePhoto:
         """Update a photo's metadata: omitted fields are unchanged, None clears a field."""
@@ -595,8 +593,8 @@ class AsyncClient(AsyncTransport):
             options: Of a TorchScript or ONNX file: `input.size=288x288,aggregator=vlad`.
             filename: Name of an open file; None for the name of the path.
         """
-        data = drop_none(name=name, options=options, licence=licence, note=note)
-        return answers.Started(**await self._send_file("/models", checkpoint, filename, data=data))
+        fields = {"name": name, "options": options, "licence": licence, "note": note}
+        return answers.Started(**await self._send_file("/models", checkpoint, filename, fields))
 
     async def models(self) -> list[answers.AddedModel]:
         """List the added models."""

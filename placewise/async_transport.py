@@ -27,6 +27,7 @@ from placewise.protocol import (
     open_file,
     printable_name,
     response_error,
+    to_text,
     validate_url,
 )
 from shared.errors import TooManyRequests, Unavailable
@@ -121,15 +122,23 @@ class AsyncTransport:
         return other
 
     async def _send_file(
-        self, path: str, file: str | Path | BinaryIO, filename: str | None = None, **options: Any
+        self,
+        path: str,
+        file: str | Path | BinaryIO | bytes,
+        filename: str | None = None,
+        fields: Json | None = None,
+        **options: Any,
     ) -> Any:
         """POST a file, by its path or open, as the form field `file`, streamed."""
         with contextlib.ExitStack() as stack:
             if isinstance(file, (str, Path)):
                 filename = filename or printable_name(Path(file))
                 file = stack.enter_context(open_file(Path(file)))
+            elif not isinstance(file, bytes) and not hasattr(file, "read"):
+                raise TypeError(f"send a path, bytes or an open file, not {type(file).__name__}")
             files = {"file": (filename or "photo", file)}
-            return await self._call("POST", path, files=files, **options)
+            data = {name: str(value) for name, value in to_text(**fields or {}).items()}
+            return await self._call("POST", path, files=files, data=data, **options)
 
     async def _call(self, method: str, path: str, **options: Any) -> Any:
         """Send a request with retries and return the JSON of its response.

@@ -123,6 +123,13 @@ def drop_none(**params: Any) -> Json:
     return {name: value for name, value in params.items() if value is not None}
 
 
+def to_text(**params: Any) -> Json:
+    """The arguments that are not None, lists as the API reads them (`a,b`), objects as JSON."""
+    lists = {k: ",".join(map(str, v)) for k, v in params.items() if isinstance(v, (list, tuple))}
+    objects = {name: json.dumps(v) for name, v in params.items() if isinstance(v, dict)}
+    return drop_none(**params | lists | objects)
+
+
 def to_jsonl(objects: Sequence[Json]) -> bytes:
     """Encode objects as JSONL."""
     return b"".join(json.dumps(item).encode() + b"\n" for item in objects)

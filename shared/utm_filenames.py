@@ -72,14 +72,11 @@ def utm_to_degrees(east: float, north: float, number: int, letter: str) -> tuple
             other = float(utm.to_latlon(east, north, number, northern=northern)[0])
             band = utm.latitude_to_zone_letter(other)
             readings.append(f"{number}{band} for {abs(other):.2f} {'N' if northern else 'S'}")
+    degrees = f"{south} to {north_end} N" if south >= 0 else f"{-south} to {-north_end} S"
     raise ValueError(
-        f"northing {north:,.0f} is not in band {letter} ({_format_band(south, north_end)}); pass "
+        f"northing {north:,.0f} is not in band {letter} ({degrees}); pass "
         f"the letter of its band: {' or '.join(readings)}"
     )
-
-
-def _format_band(south: int, north: int) -> str:
-    return f"{south} to {north} N" if south >= 0 else f"{-south} to {-north} S"
 
 
 def parse_full_date(timestamp: str) -> datetime | None:

@@ -212,7 +212,8 @@ class ExtractorWorker:
 
     def _process(self, batch: JobBatch) -> None:
         """Decode a batch and hand it on, or run all of its stages here."""
-        if _runs_exclusively(batch):
+        # Nothing may run beside it, so that a crash can be attributed to the job.
+        if batch.jobs[0].alone or batch.kind in SINGLE_CLAIM_JOBS:
             self._wait_for_stages()
             with self._query_lock:
                 self._run(batch, concurrent_jobs=0)
@@ -284,8 +285,3 @@ class ExtractorWorker:
                     self._run(query)
             if query is None and not done.wait(QUERY_PAUSE_SECONDS):
                 commits.wait(seen, IDLE_POLL_SECONDS)
-
-
-def _runs_exclusively(batch: JobBatch) -> bool:
-    """Whether nothing may run concurrently, so that a crash can be attributed to the job."""
-    return batch.jobs[0].alone or batch.kind in SINGLE_CLAIM_JOBS

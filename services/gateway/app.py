@@ -12,7 +12,7 @@ from fastapi.routing import APIRoute
 from services.gateway import metrics
 from services.gateway.admission import AdmissionControl
 from services.gateway.authentication import READ, AuthenticationMiddleware
-from services.gateway.dependencies import ALL_MAPS, API_PREFIX, GatewayContext
+from services.gateway.dependencies import ALL_MAPS, API_PREFIX, NO_REPEATS, GatewayContext
 from services.gateway.idempotency import IdempotentReplay, replay_response
 from services.gateway.metrics import GatewayMetrics
 from services.gateway.middleware import (
@@ -149,7 +149,9 @@ def _create_router() -> APIRouter:
     """
     # The id of an operation is the name of its function, unless a route has another one.
     router = APIRouter(
-        responses=PROBLEM_RESPONSES, generate_unique_id_function=lambda route: route.name
+        responses=PROBLEM_RESPONSES,
+        generate_unique_id_function=lambda route: route.name,
+        dependencies=[NO_REPEATS],
     )
     for module in RESOURCES:
         router.include_router(module.router, prefix=API_PREFIX, responses=AUTHENTICATION_RESPONSES)

@@ -242,7 +242,9 @@ class AuthenticationMiddleware:
         self._authenticator = authenticator
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or _is_public(scope["path"]):
+        path = scope.get("path", "")
+        is_public = path in PUBLIC_PATHS or path.startswith(PUBLIC_PATH_PREFIX)
+        if scope["type"] != "http" or is_public:
             await self._app(scope, receive, send)
             return
         request = Request(scope)
@@ -256,10 +258,6 @@ class AuthenticationMiddleware:
             return
         request.state.caller = caller
         await self._app(scope, receive, send)
-
-
-def _is_public(path: str) -> bool:
-    return path in PUBLIC_PATHS or path.startswith(PUBLIC_PATH_PREFIX)
 
 
 def get_caller(request: Request) -> Caller:

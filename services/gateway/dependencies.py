@@ -7,6 +7,7 @@ all waiting requests, so it can poll often without loading the database.
 from __future__ import annotations
 
 import asyncio
+import collections
 import math
 import re
 import threading
@@ -134,6 +135,7 @@ def _find_unfinished(catalog: Catalog, job_ids: set[UUID]) -> set[UUID]:
 
 
 API_PREFIX = "/api/v1"
+LIST_PARAMETERS = {"state", "kind"}
 NO_NUL_PATTERN = r"^[^\x00]*$"  # PostgreSQL's text type can't store NUL
 
 
@@ -255,6 +257,15 @@ def get_map_name(request: Request) -> str:
     return request.query_params.get("map", DEFAULT_MAP)
 
 
+async def _reject_repeated_parameters(request: Request) -> None:
+    """Raise Unprocessable: of several values, FastAPI would silently take the last one."""
+    names = (name for name, _ in request.query_params.multi_items())
+    counts = collections.Counter(name for name in names if name not in LIST_PARAMETERS)
+    for name, count in counts.most_common(1):
+        if count > 1:
+            raise invalid_field_error(name, "is given twice; commas separate several values")
+
+
 async def _accept_no_parameters(
     _params: Annotated[MapParams, Query(include_in_schema=False)],
 ) -> None:
@@ -269,6 +280,7 @@ MapQuery = Annotated[MapParams, Query()]
 PageQuery = Annotated[MapPageParams, Query()]
 NO_PARAMETERS = Depends(_accept_no_parameters)
 """Dependency of endpoints that use no query parameters."""
+NO_REPEATS = Depends(_reject_repeated_parameters)
 ALL_MAPS = Depends(_require_all_maps)
 """Dependency of endpoints about no map or all maps: keys for some maps are refused."""
 GatewayDep = Annotated[GatewayContext, Depends(_get_gateway_context)]

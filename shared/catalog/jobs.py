@@ -152,11 +152,6 @@ def _ready_condition(state: Any, lease_token: Any, waiting_for: Any) -> Conditio
     return and_(state.in_(UNFINISHED_STATES), lease_token.is_(None), waiting_for.is_(None))
 
 
-def _priority_of_kind(context: Any) -> Priority:
-    """Return the default priority of a row that is being inserted."""
-    return JOB_TYPES[context.get_current_parameters()["kind"]].priority
-
-
 class Job(Entity):
     """A job. See the module's docstring for `state`, `attempts` and the lease."""
 
@@ -165,7 +160,9 @@ class Job(Entity):
     map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"))
     kind: Mapped[JobKind] = mapped_column(String(30))
     state: Mapped[JobState] = mapped_column(String(20), default=JobState.QUEUED)
-    priority: Mapped[int] = mapped_column(Integer, default=_priority_of_kind)
+    priority: Mapped[int] = mapped_column(
+        Integer, default=lambda row: JOB_TYPES[row.get_current_parameters()["kind"]].priority
+    )
     photo_id: Mapped[UUID | None] = mapped_column(Uuid, ForeignKey("photos.id"), index=True)
     generation_id: Mapped[UUID | None] = mapped_column(Uuid, ForeignKey("generations.id"))
     params: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)

@@ -121,7 +121,9 @@ async def _handle_validation_error(request: Request, error: Exception) -> JSONRe
         errors = [
             {
                 "field": shorten(".".join(map(str, failure["loc"][1:])), MAX_FIELD_CHARACTERS),
-                "detail": "is unknown" if failure["type"] == "extra_forbidden" else failure["msg"],
+                "detail": "is unknown"
+                if failure["type"] == "extra_forbidden"
+                else failure["msg"].removeprefix("Value error, "),
             }
             for failure in failures[:MAX_REPORTED_ERRORS]
         ]

@@ -151,7 +151,7 @@ def unit_vectors(photos: PhotoTable) -> FloatArray:
 
 def _travel_seconds(sources: PhotoTable, targets: PhotoTable) -> FloatArray:
     """Return (n, m) seconds along the sequences, where the same label is the same place."""
-    seconds = _gap_seconds(sources, targets)
+    seconds = np.nan_to_num(np.abs(signed_gap_seconds(sources, targets)), nan=np.inf)
     labels = [label for label in set(targets.places.tolist()) if label is not None]
     if not labels:
         return seconds
@@ -177,11 +177,6 @@ def _nearest_seconds(photos: PhotoTable, members: PhotoTable) -> FloatArray:
             after = np.searchsorted(times, seconds).clip(1, len(times) - 1) if len(times) > 1 else 0
             nearest[rows] = np.minimum(abs(times[after] - seconds), abs(times[after - 1] - seconds))
     return nearest
-
-
-def _gap_seconds(a: PhotoTable, b: PhotoTable) -> FloatArray:
-    """Return (n, m) seconds between photos of the same sequence; infinite for others."""
-    return np.nan_to_num(np.abs(signed_gap_seconds(a, b)), nan=np.inf)
 
 
 def signed_gap_seconds(a: PhotoTable, b: PhotoTable) -> FloatArray:

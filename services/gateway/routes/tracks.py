@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from datetime import timedelta
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 from uuid import UUID
 
 from fastapi import APIRouter, Query, Request, Response
@@ -118,7 +118,7 @@ def begin_track(
             key_id=get_caller(request).key_id,
         )
         session.refresh(insert_row(session, track))
-        response = TrackResponse(**_track_fields(gateway, track, None))
+        response = TrackResponse.of_row(track, **_track_fields(track, None))
         idempotent.store_response(session, 201, response)
     return response
 
@@ -130,12 +130,10 @@ def list_tracks(gateway: GatewayDep, page: PageQuery) -> TracksResponse:
         is_of_map = Track.map_id == get_map(session, page.map).id
         tracks, next_cursor = page.read(session, Track, is_of_map)
         last = latest_states(session, [track.id for track in tracks])
-    return TracksResponse(
-        tracks=[
-            TrackResponse(**_track_fields(gateway, track, last.get(track.id))) for track in tracks
-        ],
-        next_cursor=next_cursor,
-    )
+    responses = [
+        TrackResponse.of_row(each, **_track_fields(each, last.get(each.id))) for each in tracks
+    ]
+    return TracksResponse(tracks=responses, next_cursor=next_cursor)
 
 
 @router.get(
@@ -163,8 +161,7 @@ async def read_track(
 
 
 def _read_track(gateway: GatewayContext, track_id: UUID, query: TrackReadParams) -> Response:
-    with gateway.catalog.read() as session:
-        get_track(session, get_map(session, query.map).id, track_id)
+    _check_track(gateway.catalog, query.map, track_id)
     apply_pending_frames(gateway, track_id, APPLY_SECONDS)
     with gateway.catalog.read() as session:
         track = get_track(session, get_map(session, query.map).id, track_id)
@@ -177,8 +174,9 @@ def _read_track(gateway: GatewayContext, track_id: UUID, query: TrackReadParams)
         frames = list(session.scalars(select_frames(track_id, with_evidence=query.smoothed)))
     last = next((frame for frame in reversed(frames) if frame.state is not None), None)
     smoothed = smooth_states(gateway, track, frames) if query.smoothed else {}
-    body = TrackDetailResponse(
-        **_track_fields(gateway, track, last),
+    body = TrackDetailResponse.of_row(
+        track,
+        **_track_fields(track, last),
         smoothed=query.smoothed,
         frames=[_frame_response(frame, query.map, smoothed.get(frame.id)) for frame in frames],
     )
@@ -335,18 +333,15 @@ async def _wait_until_applied(
             await wait_for_job(gateway, job_id, remaining)
 
 
-def _track_fields(gateway: GatewayContext, track: Track, last: TrackFrame | None) -> dict[str, Any]:
-    """Return the fields of `TrackResponse`; `last` is the last applied frame."""
+def _track_fields(track: Track, last: TrackFrame | None) -> dict[str, Any]:
+    """Return the fields of `TrackResponse` that are not the row's; `last` is the last applied."""
     params = TrackParams.model_validate(track.params)
     return {
         "track_id": track.id,
         "motion": params.motion,
         "max_speed_mps": params.max_speed_mps,
-        "version": track.version,
         "pending": track.version - track.revision,
         "state": None if last is None else last.state,
-        "created_at": track.created_at,
-        "updated_at": track.updated_at,
         "expires_at": track.updated_at + timedelta(days=RETENTION_DAYS),
     }
 
@@ -354,13 +349,10 @@ def _track_fields(gateway: GatewayContext, track: Track, last: TrackFrame | None
 def _frame_response(
     frame: TrackFrame, map_name: str, smoothed: TrackStateResponse | None = None
 ) -> TrackFrameResponse:
-    status: Literal["pending", "applied", "failed"] = (
-        "pending" if frame.pending else "failed" if frame.state is None else "applied"
-    )
     return TrackFrameResponse.of_row(
         frame,
         frame_id=frame.id,
-        status=status,
+        status="pending" if frame.pending else "failed" if frame.state is None else "applied",
         state=smoothed or frame.state,
         job_url=job_url(frame.job_id, map_name),
         frame_url=url_in_map(f"/tracks/{frame.track_id}/frames/{frame.id}", map_name),

@@ -337,6 +337,8 @@ class _SingleFileHandler:
         if self._field is None:
             self.file.end()
             return
+        if self._field in self.fields:
+            raise _malformed_body_error(f"the field {self._field!r} is there twice; use commas")
         try:
             self.fields[self._field] = self._value.decode("utf-8")
         except UnicodeDecodeError:

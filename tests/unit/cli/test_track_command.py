@@ -15,11 +15,8 @@ import pytest
 from PIL import Image
 
 from placewise.answers import OneTrack
-from services.cli.track.frame_sources import (
-    FrameTiming,
-    read_photo_frames,
-    read_video_frames,
-)
+from services.cli.track.command import _print_track
+from services.cli.track.frame_sources import FrameTiming, read_photo_frames, read_video_frames
 from services.cli.track.gpx import GPX_NAMESPACE, located_segments, to_gpx
 from shared.errors import InvalidRequest, Misconfigured
 from tests.support.photos import camera_exif, photo_bytes
@@ -198,6 +195,11 @@ RIDE = track_of(
     None,
     state("tracking", 45.002),
 )
+
+
+def test_a_map_that_tells_no_place_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    _print_track(track_of(state("lost", 45.0) | {"probability": 0.0}), None)
+    assert "The map has no coordinates, place labels or times" in capsys.readouterr().err
 
 
 def test_a_gpx_track_has_a_segment_for_each_part_that_is_not_lost() -> None:

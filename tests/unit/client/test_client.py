@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,20 +10,16 @@ from uuid import UUID
 
 import pytest
 
+import placewise
 from placewise.client import Client
 from shared.errors import (
     Conflict,
-    Gone,
     InvalidRequest,
     NotFound,
     PlacewiseError,
     StorageFull,
-    TooLarge,
     TooManyRequests,
-    Unauthorized,
     Unavailable,
-    Unprocessable,
-    UnsupportedMedia,
 )
 from tests.support.api_responses import JOB, PHOTO_ID, SIMILAR, STARTED, STATS, UPLOADED
 from tests.support.fake_server import FakeServer
@@ -34,28 +31,15 @@ def client(server: FakeServer) -> Iterator[Client]:
         yield made
 
 
-@pytest.mark.parametrize(
-    ("status", "kind"),
-    [
-        (400, InvalidRequest),
-        (401, Unauthorized),
-        (404, NotFound),
-        (409, Conflict),
-        (410, Gone),
-        (413, TooLarge),
-        (415, UnsupportedMedia),
-        (422, Unprocessable),
-        (503, Unavailable),
-        (500, PlacewiseError),
-        (429, TooManyRequests),
-        (507, StorageFull),
-    ],
-)
+ERRORS = [each for each in vars(placewise).values() if inspect.isclass(each)]
+
+
+@pytest.mark.parametrize("kind", [each for each in ERRORS if issubclass(each, PlacewiseError)])
 def test_problem_documents_are_raised_as_typed_errors(
-    server: FakeServer, client: Client, status: int, kind: type[PlacewiseError]
+    server: FakeServer, client: Client, kind: type[PlacewiseError]
 ) -> None:
     problem = kind("some_code", "Some detail.", file_id="abc").as_problem()
-    server.will_answer(status, {**problem, "instance": "/api/v1/uploads/abc"})
+    server.will_answer(kind.status, {**problem, "instance": "/api/v1/uploads/abc"})
     with pytest.raises(PlacewiseError) as caught:
         client.photo("abc")
     assert type(caught.value) is kind
@@ -82,7 +66,7 @@ def test_upload_sends_the_file_and_only_the_fields_that_are_given(
     server.will_answer(202, UPLOADED)
     assert client.upload(photo, latitude=45.5, place=None).file_id == UUID(PHOTO_ID)
     server.will_answer(202, UPLOADED)
-    client.upload(photo, filename="Piazza Castello.jpg")
+    client.upload(photo, "Piazza Castello.jpg", tags=["night", "wet road"], metadata={"lens": None})
     assert b'filename="Piazza Castello.jpg"' in server.requests[1][2]
     method, path, body = server.requests[0]
     assert (method, path) == ("POST", "/api/v1/upload")
@@ -90,6 +74,10 @@ def test_upload_sends_the_file_and_only_the_fields_that_are_given(
     assert b"the photo's bytes" in body
     assert b"45.5" in body
     assert b"place" not in body
+    assert b"\r\nnight,wet road\r\n" in server.requests[1][2]
+    assert b'\r\n{"lens": null}\r\n' in server.requests[1][2]
+    with pytest.raises(TypeError, match="a path, bytes or an open file, not object"):
+        client.upload(object())  # type: ignore[arg-type]
 
 
 def test_key_that_no_header_can_carry_is_refused(server: FakeServer) -> None:

@@ -45,12 +45,12 @@ def test_photos_are_fetched_page_after_page_as_they_are_reached(server: FakeServ
     server.will_answer(200, {"images": [PHOTO, PHOTO], "next_cursor": "more"})
     server.will_answer(200, {"images": [PHOTO], "next_cursor": None})
     with placewise.connect(server.url, map="lab") as places:
-        found = places.photos(place="atrium")
+        found = places.photos(tags=["a", "b"])
         next(found)
         assert len(server.requests) == 1
         assert len(list(found)) == 2
     assert "cursor=more" in server.requests[1][1]
-    assert all("map=lab" in path and "place=atrium" in path for _, path, _ in server.requests)
+    assert all("map=lab" in path and "tags=a%2Cb" in path for _, path, _ in server.requests)
 
 
 def test_wait_raises_the_error_of_a_failed_job(server: FakeServer) -> None:

@@ -305,6 +305,7 @@ def test_other_kinds_of_body_are_refused_unread(
         f"--{BOUNDARY}\r\n\r\nno name\r\n".encode() + END,
         part("form-data", b"no name") + END,
         field("place", b"\xff\xfe not UTF-8") + file() + END,
+        field("tags", "night") + field("tags", "wet") + file() + END,
     ],
 )
 def test_bodies_that_cannot_be_read_are_refused(store: FolderStore, body: bytes) -> None:

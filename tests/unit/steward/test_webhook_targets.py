@@ -127,6 +127,7 @@ def test_invalid_webhook_urls_are_refused(url: str) -> None:
     with pytest.raises(Unprocessable) as caught:
         parse_webhook_url(url, allow_private=False)
     assert caught.value.code == "invalid_field"
+    assert not url.startswith("http://") or "WEBHOOK_PRIVATE_ADDRESSES" in caught.value.detail
 
 
 def test_a_target_has_what_a_request_needs() -> None:
