@@ -14,7 +14,6 @@ import typer
 from rich.table import Column
 
 from placewise.answers import Evaluation
-from placewise.client import Client
 from placewise.protocol import drop_none
 from services.cli.client import MapOptions, wait_for_job
 from services.cli.environment import lab_missing
@@ -61,17 +60,15 @@ def evaluate_map(common: MapOptions, sample: int | None, seed: int | None) -> No
         job = wait_for_job(client, client.evaluate(**parameters), progress, "evaluating")
         requested = (e for e in client.evaluations() if not e.automatic)
         shown = list(islice(requested, MAX_EVALUATIONS_SHOWN))
-        vocabularies = _vocabulary_origins(client)
+        origins = {str(each.vocabulary_id): each.origin for each in client.vocabularies()}
+        vocabularies = {
+            each.generation_id: origins.get(str(each.vocabulary_id), "none")
+            for each in client.generations()
+        }
     if common.as_json:
         print_json(job.result or {})
         return
     _print_evaluations(shown, vocabularies)
-
-
-def _vocabulary_origins(client: Client) -> dict[UUID, str]:
-    """Origin of the vocabulary by generation ID."""
-    origins: dict[UUID | None, str] = {v.vocabulary_id: v.origin for v in client.vocabularies()}
-    return {g.generation_id: origins.get(g.vocabulary_id, "none") for g in client.generations()}
 
 
 def _print_evaluations(evaluations: list[Evaluation], vocabularies: dict[UUID, str]) -> None:

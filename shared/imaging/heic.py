@@ -47,7 +47,8 @@ def read_heic(reader: BoundedReader) -> HeicContent:
     Raises ValueError if it has no primary image, or if it is not HEVC (AVIF, for example).
     """
     boxes = {box.name: box.content for box in _boxes(reader, _meta(reader))}
-    primary = _primary(boxes[b"pitm"])
+    pitm = boxes[b"pitm"]
+    primary: int = struct.unpack_from(">H" if pitm[0] == 0 else ">I", pitm, 4)[0]
     kinds = dict(_kinds(reader, boxes[b"iinf"]))
     if kinds.get(primary) not in HEVC:
         raise ValueError("its primary picture is not HEVC")
@@ -97,11 +98,6 @@ def _boxes(reader: BoundedReader, data: bytes) -> Iterator[_Box]:
             raise ValueError(f"its box {name!r} has a wrong length")
         yield _Box(name, data[offset + 8 : offset + size])
         offset += size
-
-
-def _primary(data: bytes) -> int:
-    item: int = struct.unpack_from(">H" if data[0] == 0 else ">I", data, 4)[0]
-    return item
 
 
 def _kinds(reader: BoundedReader, data: bytes) -> Iterator[tuple[int, bytes]]:

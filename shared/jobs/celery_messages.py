@@ -20,7 +20,6 @@ import socket
 import threading
 import time
 from collections import defaultdict, deque
-from collections.abc import Sequence
 from typing import Any
 from uuid import UUID
 
@@ -219,7 +218,9 @@ class CeleryJobMessages:
         events = list(itertools.islice(self._events, EVENTS_PER_MESSAGE))
         with self._redis.pipeline(transaction=False) as pipe:
             if events:  # also a Redis that is full publishes them
-                pipe.publish(self._event_channel, _encode_events(events))
+                route = {"exchange": EVENT_EXCHANGE_NAME, "routing_key": "task.multi"}
+                headers, tag = {"hostname": events[0]["hostname"]}, events[0].get("uuid", "")
+                pipe.publish(self._event_channel, _encode(events, headers, tag, route))
             for job in withdrawn:
                 pipe.lrem(job.queue, -1, encode_message(self._app, job))
             for job in messages:
@@ -251,11 +252,6 @@ def encode_message(app: Celery, job: JobMessage) -> str:
     )
     route = {"exchange": "", "routing_key": job.queue}
     return _encode(task.body, task.headers, str(job.id), route, **task.properties)
-
-
-def _encode_events(events: Sequence[dict[str, Any]]) -> str:
-    route = {"exchange": EVENT_EXCHANGE_NAME, "routing_key": "task.multi"}
-    return _encode(events, {"hostname": events[0]["hostname"]}, events[0].get("uuid", ""), route)
 
 
 def _encode(
