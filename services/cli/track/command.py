@@ -201,7 +201,7 @@ def _print_track(track: OneTrack, out: Path | None) -> None:
         )
     print_table(table)
     states = [frame.state for frame in track.frames if frame.state is not None]
-    if not any(state.probability for state in states):
+    if states and not any(state.probability for state in states):
         print_note("The map has no coordinates, place labels or times that tell where.")
     tracked = sum(state.status == "tracking" for state in states)
     print_note(
