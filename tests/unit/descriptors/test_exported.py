@@ -295,10 +295,8 @@ def keep_open(data: bytes) -> None:
     OPEN.append(backbone(f"onnx:x:{SIZE}", data))
 
 
-def test_a_process_with_an_open_onnx_network_ends(tiny_onnx: Callable[[bool], bytes]) -> None:
-    process = multiprocessing.get_context("spawn").Process(
-        target=keep_open, args=[tiny_onnx(False)]
-    )
+def test_a_process_with_an_open_onnx_network_ends() -> None:
+    process = multiprocessing.get_context("spawn").Process(target=keep_open, args=[tiny_onnx()])
     process.start()
     process.join(90)
     is_alive = process.is_alive()
