@@ -170,6 +170,7 @@ class Machine:
         if "build" in of:
             image = self._image(of["build"]["args"]["SERVICE"])
             base = image.environment(folder, self._programs)
+            base["http_proxy"] = "http://127.0.0.1:1"  # Docker may give its proxies to containers
         else:
             base = {"PATH": f"{self._programs}:{os.environ['PATH']}", "HOME": str(folder)}
         reported = of.get("environment") or {}
