@@ -175,9 +175,8 @@ def test_every_service_runs_without_rights_that_it_does_not_need(
         assert service["security_opt"] == ["no-new-privileges:true"], name
         assert not service.get("privileged"), name
         limits = service["deploy"]["resources"]["limits"]
-        assert {"memory", "pids"} <= set(limits), name
-        describes_photos = name.startswith(("extractor", "placewise"))
-        assert ("cpus" in limits) != describes_photos, name
+        # Docker refuses more processors than the machine has, and decoders need all beside a GPU.
+        assert set(limits) == {"memory", "pids"}, name
         if name == "own-objects":
             assert (service["user"], service["cap_add"]) == ("0:0", ["CHOWN"])
             assert service["network_mode"] == "none"
