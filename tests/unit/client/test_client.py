@@ -88,7 +88,7 @@ def test_key_that_no_header_can_carry_is_refused(server: FakeServer) -> None:
         assert key not in caught.value.detail
 
 
-def test_proxies_of_the_environment_are_not_asked_for_this_machine(
+def test_proxies_of_the_environment_are_not_used_for_this_machine(
     server: FakeServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("ALL_PROXY", "http://127.0.0.1:1")
