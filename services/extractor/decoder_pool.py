@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import multiprocessing
 import os
 import pickle
 import signal
@@ -31,6 +30,7 @@ from shared.ids import new_id
 from shared.imaging.decode import DecodedPhoto, decode_photo
 from shared.imaging.file_formats import Previews
 from shared.imaging.preprocessing import Preprocessing
+from shared.limited_pool import limited_pool
 
 log = logging.getLogger(__name__)
 
@@ -150,13 +150,9 @@ class DecoderPool:
 
     def _start_pool(self) -> ProcessPool:
         is_remote = self._settings.s3_endpoint is not None
-        pool = ProcessPool(
-            max_workers=self._settings.decode_processes,
-            # Forking is not safe in a process with torch's threads and locks.
-            context=multiprocessing.get_context("spawn"),
-            initializer=prepare_process,
-            initargs=[self._memory_bytes, "shared.storage.s3" if is_remote else "shared.storage"],
-        )
+        store_module = "shared.storage.s3" if is_remote else "shared.storage"
+        prepare = functools.partial(prepare_process, store_module)
+        pool = limited_pool(self._settings.decode_processes, self._memory_bytes, prepare)
         pool.schedule(os.getpid)  # starts the processes; else the first photo would
         return pool
 

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import functools
 import importlib
-import os
 import pickle
-import resource
 import signal
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -37,14 +35,8 @@ class StoredPhoto:
     preview_key: str | None = None
 
 
-def prepare_process(memory_bytes: int, store_module: str) -> None:
-    """Limit this process's address space, and import the store that the first photo needs.
-
-    A photo that needs more memory can't be decoded.
-    """
-    # Before NumPy is imported: its threads, one for each processor, would reserve 40 MB each.
-    os.environ["OPENBLAS_NUM_THREADS"] = "1"
-    resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
+def prepare_process(store_module: str) -> None:
+    """Let Pillow reuse its memory, and import the store that the first photo needs."""
     # Without reuse, in blocks that fit images of any size, every image's memory is mapped page by
     # page and returned to the system, which took almost half of the decoding time.
     Image.core.set_block_size(PILLOW_BLOCK_BYTES)  # type: ignore[attr-defined]

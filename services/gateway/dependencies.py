@@ -306,13 +306,12 @@ def load_job_of_map(gateway: GatewayContext, map_name: str, job_id: UUID) -> Job
         return get_job(session, get_map(session, map_name).id, job_id)
 
 
-def find_job(gateway: GatewayContext, job_id: UUID) -> Job | None:
-    """Load a job; None if it was deleted."""
-    with gateway.catalog.read() as session:
-        return session.get(Job, job_id)
-
-
 async def wait_for_job(gateway: GatewayContext, job_id: UUID, seconds: float) -> Job | None:
     """Wait at most `seconds` for the end of the job; return None if the job was deleted."""
     await gateway.job_notifier.wait_until_finished(job_id, seconds)
-    return await run_in_threadpool(find_job, gateway, job_id)
+
+    def load() -> Job | None:
+        with gateway.catalog.read() as session:
+            return session.get(Job, job_id)
+
+    return await run_in_threadpool(load)

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import multiprocessing
 import os
-import resource
 import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import TimeoutError as TimedOut
@@ -23,6 +21,7 @@ from numpy.typing import NDArray
 from pebble import ProcessExpired, ProcessPool
 
 from shared.errors import Unavailable
+from shared.limited_pool import limited_pool
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -73,13 +72,8 @@ class OnnxProcess:
             is_stopping: Whether the caller's process is to stop; a running pass is then ended.
         """
         self._is_stopping = is_stopping
-        self._pool = ProcessPool(
-            max_workers=1,
-            # Forking is not safe in a process with torch's threads and locks.
-            context=multiprocessing.get_context("spawn"),
-            initializer=_prepare,
-            initargs=[data, threads],
-        )
+        prepare = functools.partial(_prepare, data, threads)
+        self._pool = limited_pool(1, MEMORY_BYTES + len(data), prepare)
         Finalize(self, _end, [self._pool], exitpriority=0)  # atexit does not run in children
 
     def open(self) -> None:
@@ -124,8 +118,6 @@ def _end(pool: ProcessPool) -> None:
 def _prepare(data: bytes, threads: int) -> None:
     global _file
     _file = data, threads
-    limit = MEMORY_BYTES + len(data)
-    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
 
 
 @functools.cache

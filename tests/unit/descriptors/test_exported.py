@@ -401,6 +401,13 @@ def test_an_onnx_file_that_never_ends_is_refused_after_its_time(
     assert "more than 1 s" in refusal(f"onnx:x:{SIZE}", make())
 
 
+def test_numpy_has_no_threads_in_the_process_of_a_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS")
+    status = OnnxProcess(tiny_onnx(), 1)._run(eval, "open('/proc/self/status').read()")
+    assert "Threads:\t1\n" in status
+
+
 def test_a_pass_ends_when_the_extractor_stops_and_the_network_goes_on_after_a_failed_pass() -> None:
     asked: list[int] = []
 
