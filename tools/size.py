@@ -1,9 +1,8 @@
 """Prints the size of the code beside its limits, and fails where a limit is exceeded: `make size`.
 
-The limits and aims are in a table of `docs/architecture.md`. `python -m tools.size --lower` lowers
-the limits there to the present figures. Raising one is a decision, and is edited by hand before the
-lines are written: the commit that raises a limit adds a decision record and changes no Python file,
-and the lines that it finds are within the limits.
+The limits and aims are in a table of `docs/architecture.md`, and are edited by hand. Raising one is
+a decision before the lines are written: the commit that raises a limit adds a decision record and
+changes no Python file, and the lines that it finds are within the limits.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ from __future__ import annotations
 import re
 import signal
 import subprocess
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
@@ -142,31 +140,10 @@ def _git(root: Path, *arguments: str) -> str:
     ).stdout
 
 
-def lower_limits(page: str, figures: Mapping[str, int]) -> str:
-    """Return the page with each limit above its figure lowered to the figure."""
-
-    def lowered(row: re.Match[str]) -> str:
-        name, limit, aim = row.groups()
-        number = _number(limit)
-        if number is None or figures.get(name, number) >= number:
-            return row[0]
-        return f"| {name} | {figures[name]:,} | {aim} |"
-
-    before, heading, section = page.partition(f"\n{HEADING}\n")
-    section, end, after = section.partition("\n## ")
-    return before + heading + ROW.sub(lowered, section) + end + after
-
-
-def main(arguments: list[str]) -> None:
+def main() -> None:
     """Print the table; exit with code 1 if a limit is exceeded."""
     figures = measure(ROOT)
-    page = (ROOT / PAGE).read_text("utf-8")
-    if arguments == ["--lower"]:
-        page = lower_limits(page, figures)
-        (ROOT / PAGE).write_text(page, "utf-8")
-    elif arguments:
-        raise SystemExit("usage: python -m tools.size [--lower]")
-    bounds = read_bounds(page)
+    bounds = read_bounds((ROOT / PAGE).read_text("utf-8"))
     numbers = [Column(name, justify="right") for name in ("now", "limit", "aim")]
     table = Table("figure", *numbers)
     for name, figure in figures.items():
@@ -196,4 +173,4 @@ def _shown(number: int | None) -> str:
 
 if __name__ == "__main__":
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends it without a traceback
-    main(sys.argv[1:])
+    main()

@@ -188,11 +188,7 @@ class ModelRegistry:
             if vocabulary.id not in self._centres:
                 centres = decode_centres(self._store.get(vocabulary.object_key))
                 if centres.sha256 != vocabulary.sha256:
-                    raise Unavailable(
-                        "vocabulary_corrupt",
-                        f"The vocabulary {vocabulary.id} is corrupt: its hash differs. "
-                        "Restore it from a backup, or fit a new one.",
-                    )
+                    raise _corrupt_error("vocabulary", vocabulary.id, "fit a new one")
                 self._centres[vocabulary.id] = centres
             return self._centres[vocabulary.id]
 
@@ -203,11 +199,7 @@ class ModelRegistry:
                 stored = decode_whitening(self._store.get(whitening.object_key))
                 projection = PcaProjection(stored.whitening, self._device)
                 if projection.sha256 != whitening.sha256:
-                    raise Unavailable(
-                        "whitening_corrupt",
-                        f"The PCA whitening {whitening.id} is corrupt: its hash differs. "
-                        "Restore it from a backup, or start a model change.",
-                    )
+                    raise _corrupt_error("whitening", whitening.id, "start a model change")
                 self._projections[whitening.id] = projection
             return self._projections[whitening.id]
 
@@ -288,3 +280,8 @@ def check_spec_matches(
         + ". Start a model change (POST /api/v1/generations), or install the old versions again.",
         generation_id=str(generation.id),
     )
+
+
+def _corrupt_error(kind: str, id_: UUID, remedy: str) -> Unavailable:
+    reason = f"The {kind} {id_} is corrupt: its hash differs"
+    return Unavailable(f"{kind}_corrupt", f"{reason}. Restore it from a backup, or {remedy}.")

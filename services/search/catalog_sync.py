@@ -193,12 +193,12 @@ class ReplicationLagTracker:
         self._lock = threading.Lock()
         self._current: dict[UUID, _GenerationVersion] = {}
         self._synced_at: dict[UUID, float] = {}
-        self._catalog_read_at: float | None = None
+        self.catalog_read_at: float | None = None
 
     def record_catalog_read(self, current: Mapping[UUID, _GenerationVersion], at: float) -> None:
         """Record the generations and versions that the catalog had at `at` (monotonic seconds)."""
         with self._lock:
-            self._catalog_read_at = at
+            self.catalog_read_at = at
             self._current = dict(current)
             # The lag of new generations counts from now on; deleted ones are dropped.
             self._synced_at = {id_: self._synced_at.get(id_, at) for id_ in current}
@@ -208,10 +208,6 @@ class ReplicationLagTracker:
         with self._lock:
             if generation_id in self._synced_at:
                 self._synced_at[generation_id] = max(at, self._synced_at[generation_id])
-
-    def has_read_catalog(self) -> bool:
-        """Whether the catalog has been read at all."""
-        return self._catalog_read_at is not None
 
     def current_lags(self, loaded: Mapping[UUID, int]) -> dict[UUID, ReplicationLag]:
         """Return the lag of every generation; `loaded` are the versions of the snapshots."""

@@ -115,7 +115,7 @@ def _check_readiness(worker: SearchWorker) -> Readiness:
     """Compute the readiness; a generation that is being built may lag, as no query uses it yet."""
     status = worker.status()
     reasons = []
-    if not worker.replication_lag.has_read_catalog():
+    if worker.replication_lag.catalog_read_at is None:
         reasons.append("the catalog has not been read yet")
     for generation_id, lag in status.lags.items():
         if not lag.answers:

@@ -28,6 +28,7 @@ from shared.jobs.progress import JobProgress
 from shared.jobs.runner import JobRunner
 from shared.jobs.transitions import succeed_job
 from shared.search_api.protocol import SearchBackend
+from shared.storage import ObjectStore
 
 
 class EvaluationWorker:
@@ -36,12 +37,14 @@ class EvaluationWorker:
     def __init__(
         self,
         catalog: Catalog,
+        store: ObjectStore,
         search: SearchBackend,
         settings: Settings,
         name: str,
         metrics: StewardMetrics | None = None,
     ) -> None:
         self._catalog = catalog
+        self._store = store
         self._search = search
         self._settings = settings
         metrics = metrics or StewardMetrics(CollectorRegistry())
@@ -64,12 +67,12 @@ class EvaluationWorker:
             searchable = count_searchable(session, generation.id)
             map_ = session.get_one(Map, job.map_id)
             labels_are_paths = decide_label_paths(session, map_)
-        radius_m = self._settings.estimate_radius_m
         evaluation = MapEvaluation(
             self._catalog,
+            self._store,
             self._search,
             generation,
-            radius_m,
+            self._settings.estimate_radius_m,
             LevelScheme(labels_are_paths=labels_are_paths, radii_m=self._settings.level_radii_m),
             map_.matching,
             progress.advance,

@@ -51,7 +51,7 @@ def serve_steward(settings: Settings, announce: Announce) -> None:
         metrics = StewardMetrics(registry)
         batches = BatchWorker(catalog, store, wakeups, settings, name, metrics)
         scheduler = Scheduler(catalog, store, wakeups, settings, metrics)
-        evaluator = EvaluationWorker(catalog, search, settings, name, metrics)
+        evaluator = EvaluationWorker(catalog, store, search, settings, name, metrics)
         libraries = LibrarySyncWorker(catalog, settings, name, metrics)
         webhooks = WebhookDispatcher(catalog, settings)
         threads = start_service_threads(

@@ -45,12 +45,6 @@ def sample_rows(available: int, sample: int, seed: int) -> NDArray[np.int64]:
     return np.sort(chosen)
 
 
-def usable_rows(rows: Rows) -> NDArray[np.bool_]:
-    """Return the (n,) mask of the (n, D) rows that are finite and not zero."""
-    lengths = np.linalg.norm(rows, axis=1)
-    return np.asarray(np.isfinite(lengths) & (lengths > 0))
-
-
 # Relative to the largest variance. Below, whitening would amplify float32 rounding errors.
 MIN_VARIANCE = 1e-9
 
@@ -189,7 +183,8 @@ def fit_pca_stream(
     with tempfile.TemporaryFile(prefix="placewise-pca-") as file:
         seen = kept = 0
         for batch in batches:
-            rows = batch[usable_rows(batch)]
+            lengths = np.linalg.norm(batch, axis=1)
+            rows = batch[np.isfinite(lengths) & (lengths > 0)]
             file.write(np.ascontiguousarray(rows, np.float32).tobytes())
             kept += len(rows)
             seen += len(batch)

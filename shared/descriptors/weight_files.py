@@ -88,12 +88,6 @@ def download_file(
         _sibling_path(part, ".etag").unlink(missing_ok=True)
 
 
-def file_sha256(path: Path) -> str:
-    """Return the hexadecimal sha256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def _resume_download(client: httpx2.Client, url: str, part: Path, on_progress: OnProgress) -> None:
     """Append one response to `part`, from its end on; raise if it is incomplete."""
     etag = _sibling_path(part, ".etag")
@@ -145,7 +139,8 @@ def _is_transient(error: httpx2.HTTPError) -> bool:
 def _check_hash(url: str, part: Path, sha256: str | None) -> None:
     if sha256 is None:
         return
-    actual = file_sha256(part)
+    with part.open("rb") as file:
+        actual = hashlib.file_digest(file, "sha256").hexdigest()
     if actual.startswith(sha256.lower()):
         return
     part.unlink()

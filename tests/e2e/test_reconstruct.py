@@ -12,11 +12,7 @@ from typing import Any
 import pytest
 
 from shared.geometry.colmap_model import read_colmap_model
-from tests.support.reconstructable_server import (
-    SCENE,
-    STRAY,
-    reconstructable_server,
-)
+from tests.support.reconstructable_server import SCENE, STRAY, reconstructable_server
 from tests.support.server import CommandLine, ServerProcess
 
 

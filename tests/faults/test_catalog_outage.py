@@ -79,7 +79,7 @@ class Deployment:
         self.client = TestClient(
             create_app(gateway), base_url="http://localhost", raise_server_exceptions=False
         )
-        evaluator = EvaluationWorker(self.catalog, self.search, settings, "evaluator")
+        evaluator = EvaluationWorker(self.catalog, store, self.search, settings, "evaluator")
         self._heartbeat = contextlib.ExitStack()
         self._heartbeat.enter_context(process_heartbeat(self.catalog, "search", self.search.state))
         self._stop = threading.Event()

@@ -82,7 +82,8 @@ class EvaluatedMap:
         return job.id
 
     def evaluator(self, search: SearchBackend | None = None) -> EvaluationWorker:
-        return EvaluationWorker(self.catalog, search or self.search, Settings(), "evaluator")
+        asked = search or self.search
+        return EvaluationWorker(self.catalog, self.store, asked, Settings(), "evaluator")
 
     def work(
         self, search: SearchBackend | None = None, stop: threading.Event | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tools.size import Bound, find_violations, lower_limits, measure, read_bounds
+from tools.size import Bound, find_violations, measure, read_bounds
 
 PAGE = """# Architecture
 
@@ -43,12 +43,6 @@ def test_a_figure_without_a_row_and_a_row_without_a_figure_are_violations() -> N
         "the table has no row `settings`",
         "nothing is counted for the row `files of the lab`",
     ]
-
-
-def test_limits_are_lowered_and_never_raised() -> None:
-    lower = lower_limits(PAGE, {"lines of the lab": 1100, "files of the lab": 3, "settings": 0})
-    assert lower == PAGE.replace("| 1,200 |", "| 1,100 |")
-    assert lower_limits(PAGE, {"lines of the lab": 1300}) == PAGE
 
 
 def test_python_files_are_counted_by_room(tmp_path: Path) -> None:

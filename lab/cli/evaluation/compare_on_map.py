@@ -104,13 +104,13 @@ class MapComparison:
             generation = active_generation(session, map_.id)
             if generation is None:
                 raise Conflict("nothing_to_evaluate", "The map has no described photo yet.")
-            scheme = LevelScheme(
-                labels_are_paths=decide_label_paths(session, map_), radii_m=settings.level_radii_m
-            )
+            paths = decide_label_paths(session, map_)
+            scheme = LevelScheme(labels_are_paths=paths, radii_m=settings.level_radii_m)
             added = list_registered_models(session)
         self._generation = generation
         self.evaluation = MapEvaluation(
             catalog,
+            store,
             cast("SearchBackend", self),  # of which only `search` is called
             generation,
             settings.estimate_radius_m,

@@ -2,8 +2,8 @@
 
 A photo is searched without itself. If its place was also photographed in another session, all
 photos of its own session are left out; else photos taken within `BURST_PERIOD` of it. Where the
-capture times are not known, only the photo itself is: its neighbours in the same walk stay in the
-map, which flatters the result.
+capture times are not known, only the photo itself and its copies are: its neighbours in the same
+walk stay in the map, which flatters the result.
 """
 
 from __future__ import annotations
@@ -38,9 +38,10 @@ from shared.place_paths import label_levels
 # A photo taken less than this before or after another one belongs to the same session.
 SAME_SESSION_PERIOD = timedelta(hours=12)
 BURST_PERIOD = timedelta(seconds=1)
+MAX_COPIES = 3  # of a photo, which are the first of its ranking
 OWN_PHOTO_RULE = (
     "without the photos of its session (12 h) where another session shows its place, else without "
-    "those of the same second"
+    "those of the same second, and always without its copies"
 )
 """what each of the map's own photos is searched without, in words"""
 
@@ -49,6 +50,8 @@ IndexRanking = tuple[Indices, NDArray[np.float64]]
 """(k,) numbers of photos, best first, and their scores"""
 RankOwnPhoto = Callable[[int], IndexRanking | None]
 """Ranks the photos of the map by their similarity to one of them, without it."""
+IsCopy = Callable[[int, int], bool]
+"""Whether two photos are the same one, in other sizes or qualities."""
 MatchOwnPhoto = Callable[[int, Sequence[Hashable]], Sequence[float | None]]
 """Returns the `match_support` of a photo with each of others; None where they can't be compared."""
 
@@ -60,6 +63,7 @@ class OwnPhotoSampler:
         locations: The locations of the map's photos; those without a place are left out.
         position_radius_m: Radius of a place in metres.
         rank: Ranks these photos. Called once per photo.
+        is_copy: Called where no capture times tell two photos apart.
     """
 
     def __init__(
@@ -69,11 +73,13 @@ class OwnPhotoSampler:
         scheme: LevelScheme,
         position_radius_m: float,
         rank: RankOwnPhoto,
+        is_copy: IsCopy = lambda photo, other: False,
     ) -> None:
         self._locations = locations
         self._scheme = scheme
         self._radius_m = position_radius_m
         self._rank = rank
+        self._is_copy = is_copy
         self._rankings: dict[int, IndexRanking | None] = {}
         self._known = np.array([spot.is_known for spot in locations], dtype=bool)
         self._latitudes = np.array([_or_nan(spot.latitude) for spot in locations])
@@ -168,6 +174,9 @@ class OwnPhotoSampler:
         else:
             left_out = apart <= BURST_PERIOD.total_seconds()
         visible[left_out] = False
+        found, _ = self.ranking(photo) or (np.zeros(0, dtype=np.int64), None)
+        for other in found[np.isnan(apart[found])][:MAX_COPIES].tolist():
+            visible[other] &= not self._is_copy(photo, other)
         return visible
 
     def _at_place(self, photo: int) -> NDArray[np.bool_]:

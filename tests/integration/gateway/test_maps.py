@@ -63,7 +63,8 @@ def live_in(service: Service, name: str) -> None:
     service.ask(near_copy(2), name)
     service.drain()
     service.json("POST", "/evaluations", 202, params=params)
-    evaluator = EvaluationWorker(service.catalog, service.search, settings, "evaluator")
+    stored = service.catalog, service.store
+    evaluator = EvaluationWorker(*stored, service.search, settings, "evaluator")
     assert evaluator.run_next(threading.Event())
     service.done(
         service("POST", "/vocabularies", params=params, json={"clusters": 3, "seed": 5}), name

@@ -207,7 +207,7 @@ def test_a_map_is_not_measured_while_the_engine_is_being_filled(
         generation = session.get_one(Generation, places.generation_id)
     scheme = LevelScheme(labels_are_paths=False, radii_m=(25.0,))
     measure = MapEvaluation(
-        catalog, tier.port, generation, 25.0, scheme, Matching.OFF, lambda: None
+        catalog, places.store, tier.port, generation, 25.0, scheme, Matching.OFF, lambda: None
     )
     sample = measure.draw_sample(1, 0)
     measure.evaluate(sample)

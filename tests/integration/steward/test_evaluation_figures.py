@@ -13,9 +13,11 @@ from services.steward.tasks.garbage_collection import collect_superseded_chunks
 from shared.catalog.chunks import Descriptor
 from shared.catalog.database.session import Catalog
 from shared.catalog.maps import Map
+from shared.storage.keys import thumbnail_key
 from tests.integration.evaluated_map import EvaluatedMap, Watched
 from tests.integration.steward.streets import HOUR, NOON, STREETS, WITHOUT_PLACE, at, query
 from tests.support.catalog_rows import delete, merge_all, read_job
+from tests.support.photos import near_copy, photo_bytes
 
 
 def test_leave_one_out_recall_is_what_one_counts_by_hand(city: EvaluatedMap) -> None:
@@ -193,6 +195,15 @@ def test_a_photo_deleted_meanwhile_counts_neither_way(city: EvaluatedMap, catalo
     assert result["leave_one_out"]["queries"] == 3
     assert result["leave_one_out"]["R@1"] == pytest.approx(2 / 3), "the pair of the gone one"
     assert (result["labelled_queries"]["queries"], result["labelled_queries"]["R@1"]) == (1, 1)
+
+
+def test_own_photos_are_searched_without_their_copies(city: EvaluatedMap) -> None:
+    """A copy stands beside every second photo; next to it are photos of other places."""
+    photos = [(n, make) for n in range(20) for make in (photo_bytes, near_copy)[: 1 + n % 2]]
+    spots = [(18 * n + (make is near_copy), {"place": str(n % 10)}) for n, make in photos]
+    for photo_id, (n, make) in zip(city.publish(spots), photos, strict=True):
+        city.store.put(thumbnail_key(photo_id), make(n))
+    assert city.figures()["places"]["levels"][0]["accuracy"] == 0
 
 
 def _forget(catalog: Catalog, photo_id: UUID) -> None:

@@ -23,12 +23,7 @@ from torch.nn.functional import normalize
 from shared.descriptors.backbones import normalise_pixels, probe_photos
 from shared.descriptors.backbones.exported import ExportedBackbone, exported_prefix
 from shared.descriptors.extractor import Extractor
-from shared.descriptors.onnx_process import (
-    PASS_SECONDS,
-    PHOTOS_PER_PASS,
-    OnnxProcess,
-    PassFailed,
-)
+from shared.descriptors.onnx_process import PASS_SECONDS, PHOTOS_PER_PASS, OnnxProcess, PassFailed
 from shared.errors import Misconfigured, Unavailable, Unprocessable
 from shared.extractor_config.configs import get_extractor_config
 from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
