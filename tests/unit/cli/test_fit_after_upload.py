@@ -29,7 +29,7 @@ def wait(
             server.will_answer(200, answer)
         job = wait_for_automatic_fit(client, Progress(disable=True))
         assert not server.answers
-        return job and job.state, [method for method, _, _ in server.requests]
+        return job.state if job else None, [method for method, _, _ in server.requests]
 
 
 def test_upload_to_a_full_disk_ends(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
