@@ -136,7 +136,7 @@ class AsyncTransport:
                 file = stack.enter_context(open_file(Path(file)))
             elif not isinstance(file, bytes) and not hasattr(file, "read"):
                 raise TypeError(f"send a path, bytes or an open file, not {type(file).__name__}")
-            files = {"file": (filename or "photo", file)}
+            files = {"file": (filename, file) if filename else file}  # or the open file's name
             data = {name: str(value) for name, value in to_text(**fields or {}).items()}
             return await self._call("POST", path, files=files, data=data, **options)
 

@@ -73,7 +73,7 @@ def _write_vocabulary(config: ExtractorConfig) -> None:
         ]
     )
     centres, iterations = _find_centres(points, config.clusters)
-    vocabulary = parse_centres(centres.numpy(), width=extractor.backbone.width)
+    vocabulary = parse_centres(centres.numpy())
     provenance = {
         "backbone": extractor.backbone.name,
         "backbone_fingerprint": extractor.backbone.fingerprint,

@@ -110,7 +110,7 @@ class Extractor:
         if self.config.shipped_vocabulary is None:
             return None
         path = SHIPPED_VOCABULARIES / self.config.shipped_vocabulary
-        centres = decode_centres(path.read_bytes(), width=self.backbone.width)
+        centres = decode_centres(path.read_bytes())
         provenance = json.loads(path.with_suffix(".json").read_text())
         if provenance["backbone_fingerprint"] != self.backbone.fingerprint:
             raise Misconfigured(

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.errors import Unprocessable
+from shared.extractor_config.configs import MAX_CLUSTERS
 from shared.storage.chunks import read_npy_header
 
 # Raised by NumPy for bytes that are not an array, or whose header declares an impossible one.
@@ -57,13 +58,11 @@ class ClusterCentres:
         return int(self.array.shape[1])
 
 
-def parse_centres(array: NDArray[np.float32], *, width: int | None = None) -> ClusterCentres:
+def parse_centres(array: NDArray[np.float32]) -> ClusterCentres:
     """Validate an array as cluster centres.
 
     Args:
         array: (clusters, dimension) of floating point numbers.
-        width: The length of the patch features that the centres are used with; None skips the
-            check.
 
     Raises:
         Unprocessable: `vocabulary_unusable`, with the reason.
@@ -74,14 +73,12 @@ def parse_centres(array: NDArray[np.float32], *, width: int | None = None) -> Cl
 
     if array.ndim != 2 or 0 in array.shape:
         raise unusable(f"its shape is {array.shape}, not (clusters, dimension)")
+    if len(array) > MAX_CLUSTERS:
+        raise unusable(f"it has {len(array)} centres, more than {MAX_CLUSTERS}")
     if array.dtype.kind != "f":
         raise unusable(f"its numbers are {array.dtype}, not floating point")
     with np.errstate(over="ignore"):  # overflow becomes infinite and is rejected below
         array = np.ascontiguousarray(array, dtype=np.float32)
-    if width is not None and array.shape[1] != width:
-        raise unusable(
-            f"its centres have {array.shape[1]} dimensions, the extractor's patch features {width}"
-        )
     if not np.isfinite(array).all():
         raise unusable("it holds NaN or infinite numbers")
     norms = np.linalg.norm(array.astype(np.float64), axis=1)
@@ -108,7 +105,7 @@ def encode_centres(centres: ClusterCentres) -> bytes:
     return buffer.getvalue()
 
 
-def decode_centres(data: bytes, *, width: int | None = None) -> ClusterCentres:
+def decode_centres(data: bytes) -> ClusterCentres:
     """Decode and validate the centres in the bytes of a `.npy` file.
 
     Raises Unprocessable (`vocabulary_unusable`).
@@ -120,7 +117,7 @@ def decode_centres(data: bytes, *, width: int | None = None) -> ClusterCentres:
             "vocabulary_unusable",
             "This is not a NumPy .npy file of cluster centres, or it is truncated.",
         ) from error
-    return parse_centres(array, width=width)
+    return parse_centres(array)
 
 
 def decode_array(data: bytes) -> NDArray[Any]:

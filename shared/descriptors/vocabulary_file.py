@@ -1,6 +1,6 @@
 """Vocabulary files for import and export, and the check that a vocabulary fits an extractor.
 
-- `.npz`, as `placewise vocabulary fit DIR --out` writes it: an uncompressed NumPy archive of
+- `.npz`, as `placewise vocabulary export` writes it: an uncompressed NumPy archive of
   `centres`, (clusters, dimension) float32, and `provenance`, one string of JSON.
   `numpy.load` reads it without pickle.
 - `.npy`: the centres alone.
@@ -171,9 +171,8 @@ def decode_vocabulary(data: bytes) -> VocabularyFile:
             infos = archive.infolist()
             # Checked before reading: many members may overlap in the same bytes.
             if sorted(info.filename for info in infos) != sorted(ARCHIVE_MEMBERS):
-                raise _vocabulary_unusable_error(
-                    f"it holds {_join_some([info.filename for info in infos]) or 'nothing'}"
-                )
+                first = ", ".join(sorted(info.filename for info in infos)[:3])
+                raise _vocabulary_unusable_error(f"it holds {first or 'nothing'}")
             members = {info.filename: _read(archive, info) for info in infos}
     except (*ARRAY_READ_ERRORS, NotImplementedError, RuntimeError) as error:
         raise _vocabulary_unusable_error(f"it can't be read ({error})") from error
@@ -218,16 +217,11 @@ def _decode_provenance(data: bytes) -> Provenance:
     return provenance
 
 
-def _join_some(names: list[str]) -> str:
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return ", ".join(sorted(names)[:3]) + more
-
-
 def _vocabulary_unusable_error(reason: str) -> Unprocessable:
     return Unprocessable(
         "vocabulary_unusable",
-        f"This .npz is not a vocabulary file as written by `placewise vocabulary fit DIR --out`: "
-        f"{reason}.",
+        f"This is not a .npz file of `placewise vocabulary export`: {reason}. Import centres alone "
+        "as a .npy file, or PyTorch's .pt with the command `placewise vocabulary import`.",
     )
 
 

@@ -174,8 +174,8 @@ def _match_existing_photo(
         raise Conflict(
             "photo_differs",
             "The map already has the same image with different metadata: "
-            f"{', '.join(differing)}. To change it: PATCH /api/v1/uploads/{photo.id}, or "
-            "`placewise index --update`.",
+            f"{', '.join(differing)}. To change it: PATCH /api/v1/uploads/{photo.id}?map="
+            f"{session.get_one(Map, photo.map_id).name}, or `placewise index --update`.",
             file_id=str(photo.id),
             differing=differing,
         )

@@ -56,7 +56,7 @@ def start_model_change(
         raise Conflict(
             "model_change_running",
             f"The map already has a running model change (job {running.id}, {running.kind}). "
-            f"Wait for it, or cancel it: POST /api/v1/jobs/{running.id}/cancel.",
+            f"Wait for it, or cancel it: POST /api/v1/jobs/{running.id}/cancel?map={map_.name}.",
             job_id=str(running.id),
         )
     job = Job(map_id=map_id, kind=kind, params=params)

@@ -64,7 +64,7 @@ def parse_webhook_url(url: str, *, allow_private: bool) -> WebhookTarget:
     except ValueError:
         raise invalid_field_error("url", "is not a URL") from None
     if parts.scheme not in schemes or not host:
-        needed = f"must begin with {' or '.join(schemes)}:// and a host"
+        needed = f"must begin with {':// or '.join(schemes)}:// and a host"
         private = "" if allow_private else "; WEBHOOK_PRIVATE_ADDRESSES=true allows http://"
         raise invalid_field_error("url", needed + private)
     if parts.username is not None or parts.password is not None or parts.fragment:

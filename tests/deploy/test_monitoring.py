@@ -55,6 +55,10 @@ def test_every_alert_says_how_bad_it_is_what_it_means_and_where_to_begin() -> No
         assert re.fullmatch(r"\d+[smh]", rule.get("for", "1m"))
         for placeholder in re.findall(r"{{(.*?)}}", rule["annotations"]["summary"]):
             assert re.match(r" \$(value|labels\.\w+)( \| humaniz\w+)? $", placeholder)
+    (down,) = (rule["expr"] for rule in group["rules"] if rule["alert"] == "PlacewiseDown")
+    scraped = yaml.safe_load((PROMETHEUS / "prometheus.yml").read_text())["scrape_configs"]
+    always = {job["job_name"] for job in scraped} - {"placewise-extractor", "prometheus"}
+    assert set(re.findall(r'absent\(up{job="(.*?)"}\)', down)) == always
     runbook = (ROOT / "docs/how-to/runbook.md").read_text()
     assert re.findall(r"^## (.+)$", runbook, re.MULTILINE) == names
 

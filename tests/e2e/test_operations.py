@@ -39,6 +39,8 @@ def test_a_running_server_is_backed_up_and_another_one_answers_as_it_did(
 
     refused = run(server.home, "storage", "restore", out, code=1)
     assert refused["code"] == "home_in_use"
+    refused = run(server.home, "storage", "backup", out / "backup.json", code=1)
+    assert refused["code"] == "out_unwritable"
     home = tmp_path / "other"
     restored = run(home, "storage", "restore", out)
     assert restored["objects"] == about["objects"]
@@ -63,14 +65,11 @@ def test_one_scrape_of_the_embedded_server_has_metrics_of_all_its_parts(
 
 
 def test_what_is_not_there_can_neither_be_backed_up_nor_verified(tmp_path: Path) -> None:
-    for command in (["backup", tmp_path / "out"], ["verify"]):
-        refused = run(tmp_path / "home", "storage", *command, code=1)
-        assert refused["code"] == "nothing_stored"
-    assert not (tmp_path / "out").exists()
-    assert (
-        run(tmp_path / "home", "storage", "restore", tmp_path / "out", code=1)["code"]
-        == "no_backup"
-    )
+    out = tmp_path / "out"
+    for code, *command in (("nothing_stored", "verify"), ("no_backup", "restore", out)):
+        assert run(tmp_path / "home", "storage", *command, code=1)["code"] == code
+    assert run(tmp_path / "home", "storage", "backup", out, code=1)["code"] == "nothing_stored"
+    assert not out.exists()
 
 
 # --- what the server tells of itself ---------------------------------------------------------

@@ -115,7 +115,7 @@ def test_the_same_bytes_again_are_the_same_photo_and_elsewhere_they_are_refused(
     for fields in elsewhere:
         body = problem(server.upload(photo_bytes(4), **fields), 409, "photo_differs")
         assert body["file_id"] == first
-        assert f"PATCH /api/v1/uploads/{first}" in body["detail"]
+        assert f"PATCH /api/v1/uploads/{first}?map=default" in body["detail"]
     found = photo(server, first)
     assert (found["latitude"], found["place"]) == (45.0, "yard")
     assert stored(server) == before

@@ -188,7 +188,7 @@ def _match_rows_to_files(
             file = max(same_name, key=partial(_common_suffix_length, recorded))
             listed.append((file, row))
         else:
-            reason = "the database has a row for this file, but the file was not found"
+            reason = "the database has a row for this file, but no such photo was found"
             missing.append({"path": row.image_path, "filename": row.name, "reason": reason})
     return listed, missing
 

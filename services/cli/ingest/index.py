@@ -126,7 +126,7 @@ def index(
         if anyloc is not None:
             _reject_options("photos of an AnyLoc service", folder_options)
             if len(sources) > 1 or not path.is_dir():
-                _reject_options("anything but one folder", {"--anyloc": anyloc})
+                _reject_options("anything but one existing folder", {"--anyloc": anyloc})
             found = read_anyloc_photos(anyloc, path)
             photos = found.photos
             about_sources = {k: v for k, v in asdict(found).items() if k != "photos"}

@@ -121,10 +121,10 @@ def upload_photos(
 
 
 def wait_for_automatic_fit(client: Client, progress: Progress) -> Job | None:
-    """Wait for the vocabulary fit that runs, or that is due and that the server is about to start.
+    """Wait for the vocabulary fits that run, or are due and that the server is about to start.
 
     Returns:
-        The job as it ended, also if it failed; None if no fit is due.
+        The last one as it ended, also if it failed; None if no fit is due.
     """
     deadline = time.monotonic() + FIT_START_SECONDS
     was_due = False
@@ -144,13 +144,14 @@ def wait_for_automatic_fit(client: Client, progress: Progress) -> Job | None:
             return None
         time.sleep(POLL_SECONDS)
     try:
-        return wait_for_job(client, job, progress, job.label.lower())
+        ended = wait_for_job(client, job, progress, job.label.lower())
     except Unprocessable as error:
         print_note(
             f"The photos are stored, but no vocabulary was fitted: {error.detail} "
             "Try it again with `placewise vocabulary fit`."
         )
         return client.job(job)
+    return wait_for_automatic_fit(client, progress) or ended  # it may have begun before the photos
 
 
 def _upload_concurrently(

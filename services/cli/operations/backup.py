@@ -26,6 +26,7 @@ from services.cli.output import (
     print_message,
     print_note,
     progress_bar,
+    refuse_unwritable,
     stage_bars,
 )
 from services.cli.recovery.backup import BackupFolder, create_backup
@@ -88,7 +89,8 @@ def backup(
     with progress_bar() as bars, open_storage(read_settings(), "backup") as (catalog, store):
         with catalog.write() as session:
             installation_id = get_or_create_installation(session).id
-        manifest = create_backup(catalog, store, installation_id, out, stage_bars(bars))
+        with refuse_unwritable(out):
+            manifest = create_backup(catalog, store, installation_id, out, stage_bars(bars))
     if as_json:
         print_json(asdict(manifest))
     else:

@@ -18,7 +18,7 @@ from services.gateway.responses import JobAcceptedResponse
 from services.gateway.uploads.multipart import FormFile, multipart_schema, receive_form_file
 from shared.catalog.chunks import estimate_described
 from shared.catalog.database.base import list_newest
-from shared.catalog.generations import Generation
+from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import get_map
 from shared.catalog.models import check_model_registered
 from shared.catalog.photos import PhotoRole, has_live_photo
@@ -111,7 +111,7 @@ def fit_vocabulary(
     "/vocabularies/import",
     status_code=202,
     openapi_extra=multipart_schema(
-        "a `.npz` file of `placewise vocabulary fit DIR`, or a `.npy` file of "
+        "a `.npz` file of `placewise vocabulary export`, or a `.npy` file of "
         "(clusters, dimension) floats"
     ),
     dependencies=[WRITE, ADMIT_JOB],
@@ -254,7 +254,10 @@ def _queue_switch(
     params: dict[str, Any] = {"vocabulary_id": None}
     if vocabulary_id is not None:
         get_vocabulary(session, map_id, vocabulary_id)
-        params = {"vocabulary_id": str(vocabulary_id), "vocabulary_chosen": True}
+        active = active_generation(session, map_id)
+        # Not by undoing PCA, or describing all photos again: fits stay automatic.
+        chosen = active is None or active.vocabulary_id != vocabulary_id
+        params = {"vocabulary_id": str(vocabulary_id), "vocabulary_chosen": chosen}
     if config is not None:
         check_model_registered(session, config)
         params["extractor"] = config.name

@@ -120,7 +120,7 @@ def _queue(
 ) -> JobAcceptedResponse:
     with gateway.catalog.write() as session:
         map_id = lock_map(session, get_map(session, map_name).id).id
-        _check_not_running(session, map_id)
+        _check_not_running(session, map_id, map_name)
         check_reconstructable(session, map_id)
         job = Job(map_id=map_id, kind=JobKind.RECONSTRUCT, params=params)
         accepted = idempotent.accept_job(session, job)
@@ -128,7 +128,7 @@ def _queue(
     return accepted
 
 
-def _check_not_running(session: Session, map_id: UUID) -> None:
+def _check_not_running(session: Session, map_id: UUID, map_name: str) -> None:
     running = session.scalar(
         select(Job.id).where(
             Job.map_id == map_id,
@@ -140,7 +140,7 @@ def _check_not_running(session: Session, map_id: UUID) -> None:
         raise Conflict(
             "reconstruction_running",
             f"The map is being reconstructed already (job {running}). Wait for it, or cancel it: "
-            f"POST /api/v1/jobs/{running}/cancel.",
+            f"POST /api/v1/jobs/{running}/cancel?map={map_name}.",
             job_id=str(running),
         )
 

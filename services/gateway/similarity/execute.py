@@ -457,7 +457,7 @@ def _no_place_reason(hits: Sequence[SearchHit], photo_filter: PhotoFilter) -> st
     if hits:
         return "The photos that look like it have no coordinates and no place label."
     if photo_filter.is_empty:
-        return "The map has no searchable photos yet, or this one has no structure to compare."
+        return "The map has no searchable photos to compare with, or this one has no structure."
     return "No photo of the map matches the filter."
 
 

@@ -215,8 +215,8 @@ def _check_losses(session: Session, job: Job, generation: Generation) -> Unproce
         f"The new model can't describe {lost} of the map's {searchable} searchable photos (at most "
         f"{MAX_LOST_SHARE:.0%} may fail), so the map keeps the current one. The first failure is "
         f"that of the photo {listed[0].photo_id}: {listed[0].error['detail']} GET "
-        "/api/v1/jobs?kind=reindex&state=failed lists all. Delete or replace these photos, or use "
-        "another model.",
+        f"/api/v1/jobs?kind=reindex&state=failed&map={session.get_one(Map, job.map_id).name} lists "
+        "all. Delete or replace these photos, or use another model.",
         lost=lost,
         searchable=searchable,
         file_ids=[str(row.photo_id) for row in listed],

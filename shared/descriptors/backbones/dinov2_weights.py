@@ -100,7 +100,7 @@ def find_or_download_weights(
     except (OSError, RuntimeError, httpx2.HTTPError) as error:
         raise _weights_missing_error(
             f"DINO_WEIGHTS is not set, and {hub_repository(size)} can't be downloaded: "
-            f"{first_error_line(error)}",
+            f"{first_error_line(error)}.",
             size,
         ) from error
 

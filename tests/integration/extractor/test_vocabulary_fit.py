@@ -369,6 +369,7 @@ def test_a_change_that_loses_more_than_one_per_cent_of_the_searchable_photos_fai
     assert (problem_of(job)["lost"], problem_of(job)["searchable"]) == (1, PHOTOS)
     assert problem_of(job)["file_ids"] == [str(bad)]
     assert f"the photo {bad}: The photo can't be decoded" in problem_of(job)["detail"]
+    assert "&map=" in problem_of(job)["detail"]
     assert (fitted.active().id, fitted.searchable()) == (old, PHOTOS)
     assert fitted.generation(new).state == GenerationState.ABANDONED
     fitted.delete(bad)

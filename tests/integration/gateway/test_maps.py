@@ -110,6 +110,8 @@ def test_choosing_a_vocabulary_switches_automatic_fits_off(service: Service) -> 
     assert (chosen["auto_fit"], chosen["next_fit_photos"]) == (False, None)
     again = service.json("PATCH", "/maps/quay", json={"auto_fit": True})
     assert (again["auto_fit"], again["next_fit_photos"]) == (True, MIN_PHOTOS_TO_FIT)
+    service.done(service("POST", "/generations", params=params, json=body), "quay")  # without PCA
+    assert service.json("GET", "/maps/quay")["auto_fit"] is True
     average = service.json("GET", "/maps/default")
     assert average["next_fit_photos"] is None, "its extractor uses no vocabulary"
 

@@ -57,8 +57,9 @@ def test_reconstruction_is_a_job_of_which_a_map_has_one_at_a_time(
     (listed,) = service.json("GET", "/jobs", params={"kind": "reconstruct"})["jobs"]
     assert (listed["label"], listed["state"]) == ("Reconstruction", "queued")
     again = problem(service("POST", "/reconstructions"), 409, "reconstruction_running")
-    assert again["job_id"] == started["job_id"]
-    service.json("POST", f"/jobs/{started['job_id']}/cancel")
+    cancel = f"/jobs/{again['job_id']}/cancel?map=default"
+    assert f"POST /api/v1{cancel}." in again["detail"]
+    service.json("POST", cancel)
     service.json("POST", "/reconstructions", 202)
 
 

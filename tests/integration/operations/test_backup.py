@@ -404,6 +404,4 @@ def test_a_folder_that_is_no_backup_or_anothers_is_left_alone(
     check_refused("other_installation", lambda: write("backup"))
     file = tmp_path / "backup/backup.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), "format": 99}))
-    check_refused(
-        "backup_of_another_release", lambda: open_backup(BackupFolder(tmp_path / "backup"))
-    )
+    check_refused("backup_of_another_release", lambda: open_backup(BackupFolder(file.parent)))

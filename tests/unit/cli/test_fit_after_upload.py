@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 from rich.progress import Progress
 
-from placewise.answers import Job
 from placewise.client import Client
 from services.cli.ingest import upload
 from services.cli.ingest.geotags import LocalPhoto
@@ -18,18 +17,19 @@ from tests.support.api_responses import JOB, STATS
 from tests.support.fake_server import running_server
 
 FIT = {**JOB, "kind": "fit", "label": "Improving the map", "state": "running"}
+ENDED = {**FIT, "state": "succeeded"}
 
 
 def wait(
     *answers: Any, photos: int = 50, next_fit: int | None = 50
-) -> tuple[Job | None, list[str]]:
-    """The job of the fit on a server with this map; the methods of the requests."""
+) -> tuple[str | None, list[str]]:
+    """The state of the fit on a server with this map; the methods of the requests."""
     with running_server() as server, Client(server.url, patience_seconds=0) as client:
         for answer in ({**STATS, "total_images": photos, "next_fit_photos": next_fit}, *answers):
             server.will_answer(200, answer)
         job = wait_for_automatic_fit(client, Progress(disable=True))
         assert not server.answers
-        return job, [method for method, _, _ in server.requests]
+        return job.state if job else None, [method for method, _, _ in server.requests]
 
 
 def test_upload_to_a_full_disk_ends(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -47,11 +47,11 @@ def jobs(*listed: Any) -> dict[str, Any]:
     return {"jobs": list(listed), "next_cursor": None}
 
 
-def test_a_running_fit_is_awaited_and_no_other_is_started() -> None:
-    job, requests = wait(jobs(FIT), FIT, {**FIT, "state": "succeeded"})
-    assert job is not None
-    assert job.state == "succeeded"
-    assert set(requests) == {"GET"}
+def test_a_running_fit_and_the_one_that_is_due_then_are_awaited_and_no_other_is_started() -> None:
+    due = {**STATS, "total_images": 81, "next_fit_photos": 50}
+    fit = (jobs(FIT), FIT, ENDED)
+    state, requests = wait(*fit, due, *fit, STATS, jobs(), photos=1)
+    assert (state, set(requests)) == ("succeeded", {"GET"})
 
 
 @pytest.mark.parametrize(("photos", "next_fit"), [(49, 50), (500, None)])
@@ -60,17 +60,13 @@ def test_no_fit_is_awaited_for_a_map_that_is_not_due(photos: int, next_fit: int 
 
 
 def test_a_fit_that_starts_and_ends_between_two_polls_is_reported() -> None:
-    ended = {**FIT, "state": "succeeded"}
     fitted = {**STATS, "total_images": 50, "next_fit_photos": 100}
-    job, _ = wait(jobs(), fitted, jobs(), jobs(ended), ended)
-    assert job is not None
-    assert job.state == "succeeded"
+    state, _ = wait(jobs(), fitted, jobs(), jobs(ENDED), ENDED, fitted, jobs())
+    assert state == "succeeded"
 
 
 def test_a_fit_that_failed_leaves_the_upload_a_success(capsys: pytest.CaptureFixture[str]) -> None:
     error = {"type": "urn:a", "title": "t", "status": 422, "code": "change_loses_photos"}
     failed = {**FIT, "state": "failed", "error": {**error, "detail": "Too many failed."}}
-    job, _ = wait(jobs(FIT), failed, failed)
-    assert job is not None
-    assert job.state == "failed"
+    assert wait(jobs(FIT), failed, failed)[0] == "failed"
     assert "Too many failed." in " ".join(capsys.readouterr().err.split())

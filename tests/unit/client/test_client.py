@@ -76,6 +76,10 @@ def test_upload_sends_the_file_and_only_the_fields_that_are_given(
     assert b"place" not in body
     assert b"\r\nnight,wet road\r\n" in server.requests[1][2]
     assert b'\r\n{"lens": null}\r\n' in server.requests[1][2]
+    server.will_answer(202, UPLOADED)
+    with photo.open("rb") as opened:
+        client.upload(opened)
+    assert b'filename="street.jpg"' in server.requests[2][2]
     with pytest.raises(TypeError, match="a path, bytes or an open file, not object"):
         client.upload(object())  # type: ignore[arg-type]
 

@@ -69,9 +69,8 @@ def test_a_vocabulary_of_other_features_is_refused_with_both_specs(
 
 def test_a_vocabulary_of_unknown_origin_only_has_to_be_as_wide(tiny: Extractor) -> None:
     check_vocabulary_fits(UNKNOWN_PROVENANCE, centres(), tiny)
-    detail = refusal(UNKNOWN_PROVENANCE, tiny, width=15).detail
-    assert "15 dimensions" in detail
-    assert "16" in detail
+    refused = refusal(UNKNOWN_PROVENANCE, tiny, width=15)
+    assert "15 dimensions, the patch features of test-tiny-vlad 16" in refused.detail
 
 
 def test_an_extractor_without_clusters_takes_no_vocabulary() -> None:

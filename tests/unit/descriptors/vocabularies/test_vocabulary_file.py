@@ -85,14 +85,15 @@ def broken_archives() -> dict[str, bytes]:
     whole = good_file().encode()
     at = whole.index(good_centres().tobytes())
     flipped = whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :]
+    pickled = npy(np.array([[Untrustworthy()]], dtype=object))
+    zero = npy(np.diag([1.0, 0.0, 1.0, 1.0]) @ good_centres())
     compressed = npz(zipfile.ZIP_DEFLATED, centres=centres, provenance=provenance)
     return {
-        "its provenance belongs to other centres": npz(
-            centres=npy(good_centres()[:3]), provenance=provenance
-        ),
+        "belongs to other centres": npz(centres=npy(good_centres()[:3]), provenance=provenance),
         "does not name the features it was fitted on": npz(centres=centres, provenance=text({})),
         "does not name the features": npz(centres=centres, provenance=text(["a list"])),
-        "it holds centres.npy": npz(centres=centres),
+        "it holds centres.npy. Import centres alone as a .npy file, or": npz(centres=centres),
+        "vocabulary export`: it holds a.npy, b.npy, c.npy.": npz(a=b"", b=b"", c=b"", d=b""),
         "it holds nothing": npz(),
         "it holds centres.npy, code.npy": npz(centres=centres, provenance=provenance, code=b"x"),
         "centres.npy is compressed": compressed,
@@ -102,13 +103,9 @@ def broken_archives() -> dict[str, bytes]:
         ),
         "Bad CRC-32": flipped,
         "it can't be read": whole[:-30],
-        "pickled objects": npz(
-            centres=npy(np.array([[Untrustworthy()]], dtype=object)), provenance=provenance
-        ),
-        "pickled": npz(centres=centres, provenance=npy(np.array([Untrustworthy()], dtype=object))),
-        "centre 1 is zero": npz(
-            centres=npy(good_centres() * np.array([[1], [0], [1], [1]])), provenance=provenance
-        ),
+        "pickled objects": npz(centres=pickled, provenance=provenance),
+        "pickled": npz(centres=centres, provenance=pickled),
+        "centre 1 is zero": npz(centres=zero, provenance=provenance),
     }
 
 
