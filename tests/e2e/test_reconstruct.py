@@ -12,11 +12,7 @@ from typing import Any
 import pytest
 
 from shared.geometry.colmap_model import read_colmap_model
-from tests.support.reconstructable_server import (
-    SCENE,
-    STRAY,
-    reconstructable_server,
-)
+from tests.support.reconstructable_server import SCENE, STRAY, reconstructable_server
 from tests.support.server import CommandLine, ServerProcess
 
 
@@ -75,11 +71,7 @@ def test_exported_model_is_one_that_can_be_imported(walk: ServerProcess) -> None
 
 
 @pytest.mark.parametrize(
-    "options",
-    [
-        ("--origin", "45,7,240"),
-        ("--from-scratch", "--import", "photos"),
-    ],
+    "options", [("--origin", "45,7,240"), ("--from-scratch", "--import", "photos")]
 )
 def test_options_that_contradict_are_refused(walk: ServerProcess, options: tuple[str, ...]) -> None:
     assert "options_contradict" in run(walk, "reconstruct", *options, fails=True)
