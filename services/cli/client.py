@@ -38,7 +38,7 @@ def connect(server: str | None, map_name: str | None, key: str | None) -> Iterat
 
     Raises:
         Misconfigured: `separate_services` if SEARCH_URLS is set and no server is named.
-        Unavailable: `server_unreachable` if the embedded server does not start in time.
+        Unavailable: `server_ended`; `server_unreachable` if the embedded server does not start.
     """
     settings = read_settings()
     find = partial(find_running_server, settings.placewise_home, START_TIMEOUT_SECONDS)
@@ -60,7 +60,16 @@ def connect(server: str | None, map_name: str | None, key: str | None) -> Iterat
     if running_server is not None:
         key = key or running_server.key
         with Client(running_server.url, key=key, map=map_name, patience_seconds=0) as client:
-            yield client
+            try:
+                yield client
+            except Unavailable as error:
+                if server or error.code != "server_unreachable":
+                    raise
+                raise Unavailable(
+                    "server_ended",
+                    f"The server on {settings.placewise_home} has ended, perhaps with the command "
+                    "that had started it. Run this command again; `placewise serve` keeps one up.",
+                ) from error
         return
     embedded_settings = settings.model_copy(update={"host": "127.0.0.1", "port": 0})
     with run_standalone(embedded_settings, lazy_extractor=True) as running:

@@ -130,10 +130,7 @@ def _active_generation_id(client: Client) -> UUID:
 
 
 @app.command("colmap")
-def colmap(
-    common: MapOptions,
-    out: FolderOption,
-) -> None:
+def colmap(common: MapOptions, out: FolderOption) -> None:
     """Export the map's reconstruction as a COLMAP model of each component: DIR/0, DIR/1, ...
 
     Images have the path or file name of their photo, and the photo's ID where that is not unique.
@@ -169,11 +166,7 @@ def pairs(
     """
     check_output_path(out, ".txt", "a list of pairs")
     count = skipped = 0
-    with (
-        common.connect() as client,
-        progress_bar() as progress,
-        atomic_write(out) as file,
-    ):
+    with common.connect() as client, progress_bar() as progress, atomic_write(out) as file:
         photos = list(client.photos())
         if names != PairNames.ID:
             _check_unique_names(photos, names)
@@ -233,11 +226,7 @@ def geojson(
     """
     check_output_path(out, ".geojson", "a GeoJSON export")
     photos = 0
-    with (
-        common.connect() as client,
-        progress_bar() as progress,
-        atomic_write(out) as file,
-    ):
+    with common.connect() as client, progress_bar() as progress, atomic_write(out) as file:
         stats = client.stats()
         total = stats.total_images + stats.labelled_queries
         file.write(b'{"type": "FeatureCollection", "features": [')

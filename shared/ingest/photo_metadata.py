@@ -281,6 +281,8 @@ def read_csv_manifest(data: bytes, source_name: str) -> list[ManifestEntry]:
         text = data.decode("utf-8-sig")
         separator = max(",;\t", key=text.partition("\n")[0].count)
         reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator)
+        if text[:4].lower() == "sep=":  # tells Excel the separator
+            next(reader.reader)
         reader.fieldnames = columns = [name.strip().lower() for name in reader.fieldnames or []]
         name_column = next((c for c in NAME_COLUMNS if c in columns), None)
         if name_column is None:

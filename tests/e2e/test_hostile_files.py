@@ -8,21 +8,13 @@ from typing import Any
 import httpx2
 import psutil
 
-from tests.e2e.hostile_files import (
-    MAX_BYTES,
-    MAX_PIXELS,
-    HostileFile,
-    corpus,
-)
+from tests.e2e.hostile_files import MAX_BYTES, MAX_PIXELS, HostileFile, corpus
 from tests.support.hostile_headers import MANY_PARTS, heic_of_endless_extents
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess
 from tests.support.waiting import wait_until
 
-SETTINGS = {
-    "max_file_size": MAX_BYTES,
-    "max_image_pixels": MAX_PIXELS,
-}
+SETTINGS = {"max_file_size": MAX_BYTES, "max_image_pixels": MAX_PIXELS}
 SECONDS = 240.0
 MOST_GROWTH_BYTES = 300_000_000  # of the server with its decoders; the bombs unpack to gigabytes
 

@@ -101,6 +101,7 @@ def test_photos_are_indexed_and_proposed_and_immich_is_changed_only_with_write(w
         assert taken == f"taken 5 s after Trip/IMG_{2 * number}.jpg"
     written = walk.run("--write")
     assert "3 photos written" in written
+    assert f"Undo: PLACEWISE_HOME={walk.home} " in written
     assert None not in sum(walk.positions(), ())
     undone = walk.run("--undo")
     assert "3 photos had none. Immich's API can't take coordinates away" in undone

@@ -74,9 +74,7 @@ def test_the_command_names_failed_photos_with_the_reason_and_retries_them(
     assert server.finished(broken)["state"] == "failed", "it is as broken as before"
 
 
-def test_jobs_are_listed_newest_first_by_state_and_kind_page_by_page(
-    server: ServerProcess,
-) -> None:
+def test_jobs_are_listed_newest_first_by_state_and_kind_page_by_page(server: ServerProcess) -> None:
     indexed = server.upload(photo_bytes(next(fresh))).json()["job_id"]
     server.finished(indexed)
     broken = failed_job(server)

@@ -8,13 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.photos import (
-    camera_exif,
-    encoded,
-    photo_bytes,
-    photo_image,
-    sidecar_position,
-)
+from tests.support.photos import camera_exif, encoded, photo_bytes, photo_image, sidecar_position
 from tests.support.server import CommandLine, ServerProcess
 
 NOON = datetime(2026, 5, 1, 12)  # noqa: DTZ001 the clock of a camera

@@ -151,12 +151,7 @@ def test_what_belongs_to_one_map_is_not_found_in_another(server: ServerProcess) 
         fields = {"place": "x"} if method == "PATCH" else None
         answer = server.client.request(method, f"/api/v1{path}", params={"map": other}, json=fields)
         problem(answer, 404, "photo_not_found")
-    for method, path in (
-        ("GET", ""),
-        ("GET", "/result"),
-        ("POST", "/cancel"),
-        ("POST", "/retry"),
-    ):
+    for method, path in (("GET", ""), ("GET", "/result"), ("POST", "/cancel"), ("POST", "/retry")):
         answer = server.client.request(
             method, f"/api/v1/jobs/{job_id}{path}", params={"map": other}
         )

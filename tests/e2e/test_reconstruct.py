@@ -71,11 +71,7 @@ def test_exported_model_is_one_that_can_be_imported(walk: ServerProcess) -> None
 
 
 @pytest.mark.parametrize(
-    "options",
-    [
-        ("--origin", "45,7,240"),
-        ("--from-scratch", "--import", "photos"),
-    ],
+    "options", [("--origin", "45,7,240"), ("--from-scratch", "--import", "photos")]
 )
 def test_options_that_contradict_are_refused(walk: ServerProcess, options: tuple[str, ...]) -> None:
     assert "options_contradict" in run(walk, "reconstruct", *options, fails=True)

@@ -49,10 +49,7 @@ def has_started(process: Process, log: Path) -> bool:
         ("gateway", ["heartbeat", "wakeups", "search-workers"]),
         ("search", ["search sync", "search sync of building generations", "heartbeat"]),
         ("extractor", ["heartbeat", "wakeups"]),
-        (
-            "steward",
-            ["wakeups", "steward", "collect_orphans", "evaluator", "batches", "webhooks"],
-        ),
+        ("steward", ["wakeups", "steward", "collect_orphans", "evaluator", "batches", "webhooks"]),
         ("serve", ["search", "extractor", "extractor process", "steward", "collect_orphans"]),
     ],
 )
@@ -93,11 +90,7 @@ def test_a_thread_that_crashes_ends_its_process(
         ("gateway", {}, "search_missing"),
         ("steward", {}, "search_missing"),
         ("extractor", {"redis_url": ""}, "redis_missing"),
-        (
-            "gateway",
-            {"search_urls": "http://127.0.0.1:9"},
-            "admin_key_missing",
-        ),
+        ("gateway", {"search_urls": "http://127.0.0.1:9"}, "admin_key_missing"),
     ],
 )
 def test_what_a_service_lacks_is_one_line(

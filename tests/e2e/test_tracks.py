@@ -55,6 +55,7 @@ def test_a_folder_of_photos_becomes_a_track_and_its_files(
     assert "tracking" in command("track", "ride", *options).stdout
     refused = command("track", "ride", "--motion", "swim")
     assert (refused.code, "invalid_field" in refused.stderr) == (1, True)
+    assert command("track", "ride", "--max-speed", "0").code == 2
     assert len(list(street.tracks())) == 2
     street.delete_track(track["track_id"])
     assert len(list(street.tracks())) == 1

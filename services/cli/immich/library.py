@@ -76,7 +76,8 @@ class ImmichLibrary:
     @property
     def undo_command(self) -> str:
         """That of `placewise immich`."""
-        return command_line("immich", "--url", self._api.url, "--undo")
+        home = self._journal.parents[1]
+        return command_line("immich", "--url", self._api.url, "--undo", home=home)
 
     def list_photos(self) -> Sequence[LibraryPhoto]:
         """List the images; their names begin with that of an album that they are in."""

@@ -111,11 +111,7 @@ def index(
         "--places-by-folder": places,
         "--role": role != PhotoRole.DATABASE,
     }
-    local_file_options = {
-        **folder_options,
-        "--anyloc": anyloc,
-        "--update": update,
-    }
+    local_file_options = {**folder_options, "--anyloc": anyloc, "--update": update}
     source, path = sources[0], Path(sources[0])
     photos: list[LocalPhoto] = []
     batch: Callable[[Client], BatchStarted] | None = None  # of objects that the server has

@@ -84,18 +84,15 @@ def upload_photos(
     pending: PendingJobs = []
     uploading = progress.add_task("uploading", total=len(photos))
 
-    def show_wait(error: PlacewiseError, seconds: float) -> None:
-        progress.update(
-            uploading, description=f"uploading (retry in {seconds:.0f} s: {error.code})"
-        )
+    def note_retry(error: PlacewiseError, _seconds: float) -> None:
         if error.code not in reported_codes:
             reported_codes.add(error.code)
             print_note(f"Retrying: {error.detail}")
 
     reported_codes: set[str] = set()
-    retrying_client = client.with_patience(RETRY_PERIOD_SECONDS, show_wait)
-    for photo, outcome in _upload_concurrently(retrying_client, photos, update):
-        progress.update(uploading, advance=1, description="uploading")
+    client = client.with_patience(RETRY_PERIOD_SECONDS, note_retry)
+    for photo, outcome in _upload_concurrently(client, photos, update):
+        progress.advance(uploading)
         if isinstance(outcome, PlacewiseError):
             refused.append(_photo_failure(photo, outcome.detail))
             continue

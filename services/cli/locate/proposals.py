@@ -159,7 +159,7 @@ def locate_library(
     else:
         _print_proposals(library, options.accept, photos, located, accepted, written)
     if preview is not None:
-        _print_changes(preview, accepted)
+        _print_changes(preview, located, accepted)
     if new:  # at the end, so that nothing is lost if it can't be written
         now = datetime.now(UTC) if preview is None else preview.searched_at
         entries = {each.name: (each.state, searches[each.name]) for each in unlocated}
@@ -213,11 +213,14 @@ def _locate_photo(
     )
 
 
-def _print_changes(preview: Preview, accepted: Sequence[LocatedPhoto]) -> None:
+def _print_changes(
+    preview: Preview, located: Sequence[LocatedPhoto], accepted: Sequence[LocatedPhoto]
+) -> None:
     """Say of which preview the written proposals are, and which of them it did not show so."""
     shown = preview.accepted
     present = {each.photo.name: each.shown() for each in accepted}
-    changed = [name for name in {**shown, **present} if shown.get(name) != present.get(name)]
+    names = (each.photo.name for each in located)  # not those that were written since
+    changed = [name for name in names if shown.get(name) != present.get(name)]
     print_note(
         f"The searches are those of {preview.searched_at.astimezone():%Y-%m-%d %H:%M}; without "
         "--write, the photos are searched again. "

@@ -76,10 +76,7 @@ def add_position(
         "GPSProcessingMethod": METHOD,
     }
     if heading is not None and "GPSImgDirection" not in there:
-        properties |= {
-            "GPSImgDirection": _hundredths(heading),
-            "GPSImgDirectionRef": TRUE_NORTH,
-        }
+        properties |= {"GPSImgDirection": _hundredths(heading), "GPSImgDirectionRef": TRUE_NORTH}
     added = "".join(
         f'\n    exif:{name}="{value}"' for name, value in properties.items() if name not in there
     )

@@ -47,8 +47,7 @@ WAIT_SECONDS = 20.0
 def track(
     common: MapOptions,
     source: Annotated[
-        Path,
-        typer.Argument(metavar="SOURCE", exists=True, help="A folder of photos, or a video."),
+        Path, typer.Argument(metavar="SOURCE", exists=True, help="A folder of photos, or a video.")
     ],
     out: Annotated[
         Path | None, typer.Option(metavar="FILE.gpx", help="Write the track as GPX.")
@@ -58,7 +57,7 @@ def track(
         typer.Option(help=f"How the camera moves: {', '.join(MOTION_MODELS)}. Default: car."),
     ] = None,
     max_speed: Annotated[
-        float | None, typer.Option(min=0, help="Maximum speed in m/s, instead of --motion.")
+        float | None, typer.Option(min=0.001, help="Maximum speed in m/s, instead of --motion.")
     ] = None,
     every: Annotated[
         float,
@@ -178,6 +177,8 @@ def _wait_for_frame(client: Client, track_id: UUID, frame: TrackFrame) -> None:
 
 
 def _print_track(track: OneTrack, out: Path | None) -> None:
+    states = [frame.state for frame in track.frames if frame.state is not None]
+    has_places = any(state.latitude is not None or state.place for state in states)
     table = Table(
         "time",
         "photo",
@@ -185,7 +186,7 @@ def _print_track(track: OneTrack, out: Path | None) -> None:
         Column("probability", justify="right"),
         Column("latitude", no_wrap=True),
         Column("longitude", no_wrap=True),
-        "place",
+        "place" if has_places else "image_id",
     )
     for frame in track.frames:
         state = frame.state
@@ -197,10 +198,9 @@ def _print_track(track: OneTrack, out: Path | None) -> None:
             format_percent(state.probability if state else None),
             f"{at.latitude:.6f}" if at else "",
             f"{at.longitude:.6f}" if at else "",
-            escape((state and state.place) or ""),
+            escape(str((state and (state.place if has_places else state.image_id)) or "")),
         )
     print_table(table)
-    states = [frame.state for frame in track.frames if frame.state is not None]
     if states and not any(state.probability for state in states):
         print_note("The map has no coordinates, place labels or times that tell where.")
     tracked = sum(state.status == "tracking" for state in states)

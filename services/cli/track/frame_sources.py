@@ -13,6 +13,7 @@ from PIL import Image
 from services.cli.locate.folder import read_folder
 from services.cli.output import print_note, printable_path
 from shared.errors import InvalidRequest, Misconfigured
+from shared.imaging.file_formats import PHOTO_SUFFIXES
 
 UNKNOWN_BEGIN = datetime.fromtimestamp(0, UTC)  # the time of a file is that of its last copy
 MIN_STEP = timedelta(milliseconds=1)  # between photos whose clocks show the same time
@@ -71,7 +72,7 @@ def read_photo_frames(folder: Path, timing: FrameTiming) -> list[SourceFrame]:
 def read_video_frames(video: Path, timing: FrameTiming, folder: Path) -> Iterator[SourceFrame]:
     """Decode a frame of a video every `timing.every_seconds` and write it to a folder as JPEG.
 
-    Frames are turned as players turn them.
+    Frames are turned as players turn them. A file is deleted when the next frame is asked for.
 
     Raises:
         Misconfigured: `no_video_decoder`.
@@ -88,10 +89,11 @@ def read_video_frames(video: Path, timing: FrameTiming, folder: Path) -> Iterato
         ) from error
     try:
         with av.open(str(video)) as container:
-            if not container.streams.video:
+            if video.suffix.lower() in PHOTO_SUFFIXES or not container.streams.video:
                 raise InvalidRequest(
                     "unreadable_video",
-                    f"{printable_path(video)} is neither a folder of photos nor a video.",
+                    f"{printable_path(video)} is neither a folder of photos nor a video. "
+                    "Where a single photo was taken: placewise query PHOTO.",
                 )
             recorded = _parse_created(container.metadata.get("creation_time"))
             first = timing.begin or recorded or UNKNOWN_BEGIN
@@ -115,6 +117,7 @@ def read_video_frames(video: Path, timing: FrameTiming, folder: Path) -> Iterato
                 image = Image.fromarray(frame.to_ndarray(format="rgb24"))
                 image.rotate(frame.rotation, expand=True).save(path, quality=JPEG_QUALITY)
                 yield SourceFrame(path, path.name, first + timedelta(seconds=seconds))
+                path.unlink()
     except av.FFmpegError as error:
         raise InvalidRequest(
             "unreadable_video", f"Can't read the video {printable_path(video)}: {error}"

@@ -10,6 +10,7 @@ import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from typing import Any
 from uuid import UUID
 
@@ -396,8 +397,10 @@ def _estimate(
     elif (
         places is not None
         and model.is_fitted
-        and not found.ranking[0].location.is_known
-        and model.may_lack_place(places, found.ranking[0].score, elsewhere)
+        and any(
+            model.may_lack_place(places, ranked.score, elsewhere)
+            for ranked in takewhile(lambda each: not each.location.is_known, found.ranking)
+        )
     ):
         places = None  # the map shows its place, and does not know where that is
     reason = _no_place_reason(found.hits, search_params.photos)

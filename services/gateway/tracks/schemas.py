@@ -11,7 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_valida
 
 from shared.geodesy import distance_m
 from shared.http.request_model import RequestModel
-from shared.ingest.photo_metadata import parse_time
+from shared.ingest.photo_metadata import coordinate_pair, parse_time
 from shared.responses.similarity import EstimateLevelResponse
 from shared.responses.tracks import TrackStateResponse
 from shared.tracks.evidence import Odometry, PositionFix
@@ -97,11 +97,10 @@ class FrameForm(BaseModel):
 
     def fix(self) -> PositionFix | None:
         """Return the measured position, if any."""
-        if self.latitude is None or self.longitude is None or self.accuracy_m is None:
+        latitude, longitude = coordinate_pair(self.latitude, self.longitude)
+        if latitude is None or longitude is None or self.accuracy_m is None:
             return None
-        return PositionFix(
-            latitude=self.latitude, longitude=self.longitude, accuracy_m=self.accuracy_m
-        )
+        return PositionFix(latitude=latitude, longitude=longitude, accuracy_m=self.accuracy_m)
 
     def odometry(self) -> Odometry | None:
         """Return the odometry, if any."""

@@ -59,6 +59,7 @@ OUT_OF_MAP_SHARE = 0.02  # of the frames of tracks, and of queries before a map 
 UNMAPPED_SHARE = 0.05  # of queries within the map's extent whose place has no photo
 ELSEWHERE_SHARE = 0.33  # of queries that are from elsewhere, unless the caller says otherwise
 DEFAULT_CERTAINTY = 0.95
+COPY_SCORE = 1 - 2**-11  # of the query's own picture; stored rows may be float16
 MIN_LABELLED_QUERIES = 40
 SMALL_MAP_PHOTOS = 2000  # with fewer, the coefficients stay near the prior's
 PRIOR_FILE = Path(__file__).with_name("prior.json")
@@ -336,15 +337,15 @@ class PlaceModel(BaseModel):
         """Return whether a photo of unknown place shows the query's place more probably than those
         of an estimate do.
 
-        It leads the best of them by more than the first photo of a ranking does the last; or no
-        level is probable, and it is too similar for a photo of elsewhere.
+        It leads the best of them by more than the first photo of a ranking does the last, and is no
+        copy of the query; or no level is probable, and it is too similar for a photo of elsewhere.
 
         Args:
             score: Of the photo.
             elsewhere: As in `probabilities`.
         """
         finest = estimate.levels[0]
-        if score - finest.best_score > (self.spread or math.inf):
+        if score < COPY_SCORE and score - finest.best_score > (self.spread or math.inf):
             return True
         if estimate.is_probable:
             return False

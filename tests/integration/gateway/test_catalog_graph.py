@@ -107,10 +107,7 @@ def test_the_graph_of_the_catalog_equals_that_of_arrays(catalog: Catalog, map_id
     ids=["a fix of 100 km", "a label without positions"],
 )
 def test_the_size_of_a_step_does_not_depend_on_the_number_of_photos_at_a_fix_or_label(
-    catalog: Catalog,
-    monkeypatch: pytest.MonkeyPatch,
-    is_located: bool,
-    fix: PositionFix | None,
+    catalog: Catalog, monkeypatch: pytest.MonkeyPatch, is_located: bool, fix: PositionFix | None
 ) -> None:
     most_near, most_photos, most_of_label = 60, 20, 30
     monkeypatch.setattr(filter_module, "MAX_PHOTOS", most_photos)

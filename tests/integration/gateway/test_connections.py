@@ -206,11 +206,7 @@ def test_a_body_that_comes_too_slowly_is_answered_408_and_no_error_is_logged(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     with serving(body_bytes_per_second=1000, body_window_seconds=0.5) as server:
-        with (
-            server.connect() as slow,
-            server.connect() as slow_json,
-            server.connect() as fast,
-        ):
+        with server.connect() as slow, server.connect() as slow_json, server.connect() as fast:
             slow.sendall(HEAD + b"x")
             slow_json.sendall(HEAD.replace(b"/count", b"/json") + b"x")
             fast.sendall(HEAD)

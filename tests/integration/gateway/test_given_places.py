@@ -106,9 +106,7 @@ def test_a_place_is_given_and_taken_back(service: Service) -> None:
     assert again == {"restored": [], "changed_since": []}
 
 
-def test_a_denied_place_is_kept_and_not_proposed_until_that_is_taken_back(
-    service: Service,
-) -> None:
+def test_a_denied_place_is_kept_and_not_proposed_until_that_is_taken_back(service: Service) -> None:
     stored(service, 1, taken(0), latitude=45.0, longitude=7.0)
     photo = stored(service, 2, taken(20))
     (proposal,) = propose(service)["proposals"]

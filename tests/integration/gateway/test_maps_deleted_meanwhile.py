@@ -106,10 +106,7 @@ def test_jobs_of_a_deleted_map_are_cancelled_in_small_transactions(
 
 
 def test_a_search_whose_map_is_removed_meanwhile_finds_no_map(
-    service: Service,
-    catalog: Catalog,
-    store: FolderStore,
-    monkeypatch: pytest.MonkeyPatch,
+    service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service.json("POST", "/maps", 201, json={"name": "gone", "extractor": "test-tiny-avg"})
     photo_id, _ = service.indexed(1, 2, map_name="gone")

@@ -310,17 +310,20 @@ def nearest(service: Service, number: int) -> str:
 
 
 def test_measured_positions_help(street: Service) -> None:
-    alone, placed = begin(street), begin(street)
+    alone, placed, without_fix = begin(street), begin(street), begin(street)
     fix: dict[str, Any] = {"latitude": latitude_of(0), "longitude": 7, "accuracy_m": 10}
     send(street, placed, 0, **fix)
     odometry: dict[str, Any] = {"distance_m": 80, "distance_accuracy_m": 5, "turn_degrees": 10}
     send(street, placed, 1, **odometry)
     ride(street, alone, 0, 1)
-    first, measured = (
+    send(street, without_fix, 0, latitude=0, longitude=0, accuracy_m=10)
+    ride(street, without_fix, 1)
+    first, measured, unmeasured = (
         [frame["state"]["probability"] for frame in read(street, track)["frames"]]
-        for track in (alone, placed)
+        for track in (alone, placed, without_fix)
     )
     assert measured[0] > first[0]
+    assert unmeasured == first, "0, 0 is no fix"
     smoothed = read(street, placed, smoothed=True)["frames"]
     assert smoothed[0]["state"]["probability"] >= measured[0] - 1e-9
 

@@ -9,11 +9,13 @@ import pytest
 from rich.progress import Progress
 
 from placewise.client import Client
+from services.cli import client as cli_client
 from services.cli.ingest import upload
 from services.cli.ingest.geotags import LocalPhoto
 from services.cli.ingest.upload import wait_for_automatic_fit
-from shared.errors import StorageFull
-from tests.support.api_responses import JOB, STATS
+from shared.config.embedded_home import RunningServer
+from shared.errors import StorageFull, Unavailable
+from tests.support.api_responses import JOB, STATS, UPLOADED
 from tests.support.fake_server import running_server
 
 FIT = {**JOB, "kind": "fit", "label": "Improving the map", "state": "running"}
@@ -41,6 +43,28 @@ def test_upload_to_a_full_disk_ends(monkeypatch: pytest.MonkeyPatch, tmp_path: P
             server.will_answer(507, StorageFull("disk_full", "The disk is full.").as_problem())
         with pytest.raises(StorageFull):
             upload.upload_photos(client, [LocalPhoto(photo, {})] * 100, Progress(disable=True))
+
+
+def test_photos_are_awaited_while_the_server_is_away(tmp_path: Path) -> None:
+    (photo := tmp_path / "a.jpg").write_bytes(b"a photo")
+    away = Unavailable("server_unreachable", "It is restarted.").as_problem()
+    ended = {**JOB, "state": "succeeded"}
+    answers = [STATS, UPLOADED, away, ended, away, STATS, jobs(), away, STATS]
+    with running_server() as server, Client(server.url, patience_seconds=0) as client:
+        for answer in answers:
+            server.will_answer(503 if answer is away else 200, answer)
+        report = upload.upload_photos(client, [LocalPhoto(photo, {})], Progress(disable=True))
+    assert (report["uploaded"], report["failed"]) == (1, [])
+
+
+def test_a_server_that_has_ended_with_its_command_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = RunningServer("http://127.0.0.1:9")
+    monkeypatch.setattr(cli_client, "find_running_server", lambda *_: ended)
+    with (
+        pytest.raises(Unavailable, match="has ended, perhaps with the command"),
+        cli_client.connect(None, None, None) as client,
+    ):
+        client.stats()
 
 
 def jobs(*listed: Any) -> dict[str, Any]:

@@ -99,10 +99,11 @@ def test_a_video_has_its_own_clock_which_is_named(
 def test_a_video_gives_a_frame_every_so_many_seconds(
     video: Path, tmp_path: Path, every: float, seconds: list[float]
 ) -> None:
-    frames = list(read_video_frames(video, FrameTiming(every, NOON), tmp_path))
-    assert [(f.captured_at - NOON).total_seconds() for f in frames] == pytest.approx(seconds)
-    shades = [np.asarray(Image.open(frame.path)).mean() for frame in frames]
-    assert shades == pytest.approx([40, 100, 160], abs=8)
+    frames = read_video_frames(video, FrameTiming(every, NOON), tmp_path)
+    shown = [(f.captured_at - NOON, np.asarray(Image.open(f.path)).mean()) for f in frames]
+    assert [time.total_seconds() for time, _ in shown] == pytest.approx(seconds)
+    assert [shade for _, shade in shown] == pytest.approx([40, 100, 160], abs=8)
+    assert list(tmp_path.iterdir()) == [video], "a frame is deleted once it was sent"
 
 
 @pytest.mark.parametrize(("rotation", "turns"), [(0, 0), (90, 1), (-90, 3), (180, 2), (-180, 2)])
@@ -121,7 +122,7 @@ def test_frames_are_turned_as_the_display_matrix_of_the_video_says(
         stream.set_display_rotation(rotation) if rotation else None
         container.mux(stream.encode(av.VideoFrame.from_ndarray(stored, format="rgb24")))
         container.mux(stream.encode())
-    (frame,) = read_video_frames(path, UNKNOWN, tmp_path)
+    frame = next(read_video_frames(path, UNKNOWN, tmp_path))
     found = np.asarray(Image.open(frame.path)).astype(int)
     assert found.shape == shown.shape
     assert abs(found - shown).mean() < 12
@@ -141,14 +142,15 @@ def test_raw_stream_without_times_is_refused_with_the_way_to_give_it_some(tmp_pa
 def test_unreadable_videos_and_a_missing_decoder_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = tmp_path / "notes.txt"
-    text.write_text("no video")
-    with pytest.raises(InvalidRequest, match=r"notes\.txt") as refusal:
-        list(read_video_frames(text, UNKNOWN, tmp_path))
-    assert refusal.value.code == "unreadable_video"
+    (tmp_path / "notes.txt").write_text("no video")
+    (tmp_path / "photo.JPG").write_bytes(photo_bytes(1))
+    for name in ("notes.txt", "photo.JPG"):
+        with pytest.raises(InvalidRequest, match=name) as refusal:
+            list(read_video_frames(tmp_path / name, UNKNOWN, tmp_path))
+        assert refusal.value.code == "unreadable_video"
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(Misconfigured, match=r"uv pip install '\.\[tracks\]'"):
-        list(read_video_frames(text, UNKNOWN, tmp_path))
+        list(read_video_frames(tmp_path / "notes.txt", UNKNOWN, tmp_path))
 
 
 def state(status: str, latitude: float | None) -> dict[str, Any]:
@@ -198,8 +200,10 @@ RIDE = track_of(
 
 
 def test_a_map_that_tells_no_place_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    _print_track(track_of(state("lost", 45.0) | {"probability": 0.0}), None)
-    assert "The map has no coordinates, place labels or times" in capsys.readouterr().err
+    _print_track(track_of(state("lost", None) | {"probability": 0.0}), None)
+    printed = capsys.readouterr()
+    assert "The map has no coordinates, place labels or times" in printed.err
+    assert str(UUID(int=1)) in printed.out, "the photo of the map that is nearest"
 
 
 def test_a_gpx_track_has_a_segment_for_each_part_that_is_not_lost() -> None:

@@ -95,9 +95,11 @@ def test_other_text_is_written_and_read_as_it_is() -> None:
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])
-def test_a_table_may_be_as_a_spreadsheet_and_its_user_write_it(separator: str) -> None:
-    table = "Filename,LATITUDE ,tags\r\na.jpg,45|5,x\r\n,,\r\n".replace(",", separator)
-    entry = ManifestEntry(2, "a.jpg", {"latitude": "45.5", "tags": "x"})
+@pytest.mark.parametrize("first", ["", "sep=,\r\n", "SEP=,\n"])
+def test_a_table_may_be_as_a_spreadsheet_and_its_user_write_it(separator: str, first: str) -> None:
+    table = first + "Filename,LATITUDE ,tags\r\na.jpg,45|5,x\r\n,,\r\n"
+    table = table.replace(",", separator)
+    entry = ManifestEntry(3 if first else 2, "a.jpg", {"latitude": "45.5", "tags": "x"})
     assert read_csv_manifest(table.replace("|", ",").encode("utf-8-sig"), "t") == [entry]
 
 

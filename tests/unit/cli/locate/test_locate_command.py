@@ -332,6 +332,8 @@ def test_what_a_preview_has_shown_is_written_although_the_map_answers_differentl
     assert written.exit_code == 0, written.output
     assert "1 proposals are not as they were accepted then" in written.stderr
     assert written.stderr.rstrip().endswith(": new.jpg")
+    again = run(folder, "--write", "--server", server.url, picture=True)
+    assert "All proposals are as they were then" in again.stderr, "those that are left"
     written_now = read_folder(folder, None, 0.0)
     latitudes = {
         each.name: each.latitude for each in written_now if (folder / f"{each.id}.xmp").exists()
