@@ -123,7 +123,7 @@ class MapExtent(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     diameter_m: float | None = None
-    """distance that no two photos exceed; None without coordinates"""
+    """distance that no two photos exceed; None if a photo has no coordinates"""
     place: str | None = None
     """finest level of labels that all photos share"""
 
@@ -139,7 +139,7 @@ class MapExtent(BaseModel):
             if spot.latitude is not None and spot.longitude is not None
         ]
         diameter_m = None
-        if points:
+        if points and len(points) == len(locations):
             latitudes, longitudes = np.array(points).T
             longitudes = (longitudes - longitudes[0] + 180) % 360  # both sides of the antimeridian
             north, east = ((each.min() + each.max()) / 2 for each in (latitudes, longitudes))
@@ -149,19 +149,16 @@ class MapExtent(BaseModel):
 
     def end_levels(self, levels: Sequence[CandidateLevel]) -> list[CandidateLevel]:
         """Return the levels that are smaller than the map, and as the last one the whole map."""
-        finest_m, largest_m = levels[0].radius_m, levels[-1].radius_m
-        radius_m = finest_m and max(finest_m, self.diameter_m or largest_m or 0.0)
-        whole = replace(
-            levels[-1],
-            place=self.place if radius_m is None else None,
-            radius_m=radius_m,
-            is_whole_map=True,
-        )
-        labels = [level.place for level in levels]
-        if radius_m is not None:
+        finest_m, labels = levels[0].radius_m, [level.place for level in levels]
+        whole = replace(levels[-1], is_whole_map=True)
+        if finest_m is not None and self.diameter_m is not None:
+            radius_m = max(finest_m, self.diameter_m)
+            whole = replace(whole, radius_m=radius_m)
             smaller = [level for level in levels if (level.radius_m or 0.0) < radius_m]
-        else:
-            smaller = list(levels[: labels.index(self.place)] if self.place in labels else levels)
+        else:  # a photo without coordinates may be anywhere
+            whole = replace(whole, place=self.place, latitude=None, longitude=None, radius_m=None)
+            end = labels.index(self.place) if self.place and self.place in labels else None
+            smaller = list(levels[:end])
         return [*smaller, whole]
 
 

@@ -41,11 +41,7 @@ from shared.evaluation.places.probability import (
     shipped_prior,
 )
 from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
-from shared.evaluation.places.thresholds import (
-    CERTAINTIES,
-    HeldOutEstimate,
-    choose_threshold,
-)
+from shared.evaluation.places.thresholds import CERTAINTIES, HeldOutEstimate, choose_threshold
 from shared.geodesy import distance_m
 from shared.place_paths import is_within_level, label_levels, look_like_paths
 
@@ -325,6 +321,15 @@ def test_the_whole_map_is_named_by_the_label_that_all_photos_share() -> None:
     ]  # fmt: skip
 
 
+def test_a_map_with_a_photo_that_has_no_coordinates_has_no_radius() -> None:
+    extent = MapExtent.of([north(0), north(10), label("hall")], PLAIN)
+    circles = [CandidateLevel(latitude=45.0, longitude=7.0, radius_m=r) for r in (25.0, 100.0)]
+    levels = extent.end_levels(circles)
+    assert [(level.latitude, level.radius_m, level.is_whole_map) for level in levels] == [
+        (45.0, 25.0, False), (45.0, 100.0, False), (None, None, True),
+    ]  # fmt: skip
+
+
 def test_the_more_similar_the_best_photo_and_the_less_its_rivals_the_less_is_it_elsewhere() -> None:
     known = shipped_prior().elsewhere["efficientnet-lite0-vlad128"]
     by_score = [known.probability(of_score(score), 0.33) for score in (0.03, 0.1, 0.15, 0.3)]
@@ -512,13 +517,7 @@ def test_model_knows_how_often_a_place_that_it_lacks_is_taken_for_one_that_looks
 
 
 @pytest.mark.parametrize(
-    ("places", "per_place", "noise"),
-    [
-        (40, 5, 0.6),
-        (20, 3, 0.6),
-        (4, 5, 0.3),
-        (1, 60, 1.0),
-    ],
+    ("places", "per_place", "noise"), [(40, 5, 0.6), (20, 3, 0.6), (4, 5, 0.3), (1, 60, 1.0)]
 )
 def test_probabilities_hold_in_maps_of_any_size_if_so_many_queries_are_from_elsewhere(
     places: int, per_place: int, noise: float
