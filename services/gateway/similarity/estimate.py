@@ -34,8 +34,10 @@ LOOK_ALIKE = (
 
 def locate_hits(hits: Sequence[SearchHit], photos: Mapping[UUID, Photo]) -> list[RankedPhoto]:
     """Join hits with the locations of their photos."""
+    located = ((hit, photos[hit.photo_id]) for hit in hits)
     return [
-        RankedPhoto(hit.score, _photo_location(photos[hit.photo_id]), hit.photo_id) for hit in hits
+        RankedPhoto(hit.score, PhotoLocation(p.latitude, p.longitude, p.place), hit.photo_id)
+        for hit, p in located
     ]
 
 
@@ -201,7 +203,3 @@ def _metres(length_m: float) -> str:
     if length_m < 9.95:
         return f"{length_m:.1f} m"
     return f"{length_m:.0f} m" if length_m < 999.5 else f"{round(length_m / 1000, 1):g} km"
-
-
-def _photo_location(photo: Photo) -> PhotoLocation:
-    return PhotoLocation(photo.latitude, photo.longitude, photo.place)
