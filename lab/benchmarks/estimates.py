@@ -113,10 +113,6 @@ class Judged:
     """of the bootstrap"""
 
     @property
-    def is_placed(self) -> bool:
-        return self.estimate.answer is not None or self.estimate.in_map is True
-
-    @property
     def is_finest(self) -> bool:
         return self.estimate.answer == 0
 
@@ -198,7 +194,7 @@ def add_published(report: Report, what: str, photos: DescribedPhotos) -> list[Ju
     foreign = {name: trial.judge(model, numbers) for name, numbers in photos.foreign.items()}
     for name, each in foreign.items():
         share = Share(
-            "answered or in the map", each, lambda j: j.is_placed, at_most=100 * (1 - CERTAINTY)
+            "in the map", each, lambda j: j.estimate.in_map is True, at_most=100 * (1 - CERTAINTY)
         )
         _add_shares(report, f"{what}, photos of {name}", share)
     elsewhere = list(chain(*foreign.values()))
@@ -281,7 +277,7 @@ class TrialMap:
         self.photos = photos
         self._rows = photos.rows[self.members]
         scores = self._rows @ self._rows.T
-        self.background = measure_background(self._rows)
+        self.background = measure_background(self._rows, self.match if photos.match else None)
         self.locations = [photos.locations[index] for index in self.members]
         self.extent = MapExtent.of(self.locations, photos.scheme)
         self.own_photos = OwnPhotoSampler(

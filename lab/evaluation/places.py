@@ -22,7 +22,7 @@ from shared.evaluation.places.figures import (
 from shared.evaluation.places.fit import MapScores, fit_place_model
 from shared.evaluation.places.levels import LevelScheme, candidate_levels
 from shared.evaluation.places.probability import Background, MapExtent
-from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
+from shared.evaluation.places.samples import IndexRanking, MatchOwnPhoto, OwnPhotoSampler
 from shared.evaluation.places.thresholds import HeldOutEstimate
 
 SAMPLED_PHOTOS = 1000
@@ -30,6 +30,7 @@ SAMPLED_PHOTOS = 1000
 RANKS = 800  # depth of the search for other places where hundreds of photos show the same one
 SEED = 0
 RANDOM_PAIRS = 4000
+MATCHED_PAIRS = 100
 
 
 class _RowRanker:
@@ -137,11 +138,14 @@ def measure_places(
     }
 
 
-def measure_background(rows: Rows) -> Background:
-    """Return mean and deviation of the scores of random pairs of (n, D) unit descriptors."""
-    first, second = np.random.default_rng(SEED).integers(len(rows), size=(2, RANDOM_PAIRS))
-    apart = first != second
-    return Background.of(np.einsum("nd,nd->n", rows[first[apart]], rows[second[apart]]).tolist())
+def measure_background(rows: Rows, match: MatchOwnPhoto | None = None) -> Background:
+    """Return what random pairs of (n, D) unit descriptors, and of their photos, score."""
+    pairs = np.random.default_rng(SEED).integers(len(rows), size=(RANDOM_PAIRS, 2))
+    first, second = (pairs := pairs[pairs[:, 0] != pairs[:, 1]]).T
+    matched = pairs[:MATCHED_PAIRS].tolist()
+    supports = [match(photo, [other])[0] for photo, other in matched] if match else []
+    scores = np.einsum("nd,nd->n", rows[first], rows[second]).tolist()
+    return Background.of(scores, [each for each in supports if each is not None])
 
 
 def _photo_location(photo: DatasetPhoto) -> PhotoLocation:

@@ -352,16 +352,20 @@ class MapEvaluation:
         return places, False if len(photos) >= MIN_PHOTOS_TO_DECIDE else None
 
     def _measure_background(self, sample: Sequence[GeotaggedPhoto]) -> Background:
-        """Return mean and deviation of the scores of random pairs of photos."""
+        """Return what random pairs of photos score, and how well they match."""
         others = [
             photo.photo_id for photo in _draw(self.database.photos, BACKGROUND_PHOTOS, seed=1)
         ]
         among = PhotoFilter(ids=tuple(others))
         scores: list[float] = []
-        for photo in _draw(sample, BACKGROUND_QUERIES, seed=2):
+        supports: list[float | None] = []
+        for number, photo in enumerate(_draw(sample, BACKGROUND_QUERIES, seed=2)):
             ranking = self.search.rank_similar(photo, len(others), among) or []
             scores += [hit.score for hit, _ in ranking]
-        return Background.of(scores)
+            if self.matching != Matching.OFF:
+                pairs = set(others[number::BACKGROUND_QUERIES]) - {photo.photo_id}
+                supports += self.search.match(photo.photo_id, list(pairs))
+        return Background.of(scores, [each for each in supports if each is not None])
 
     def _order_by_matches(
         self, query: GeotaggedPhoto, ranked: Iterable[GeotaggedPhoto]

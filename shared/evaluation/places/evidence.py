@@ -100,12 +100,7 @@ def estimate_location(ranking: Sequence[RankedPhoto], radius_m: float) -> PhotoL
     nearby = [
         r
         for r in ranking[:VOTING_PHOTOS]
-        if r.location.latitude is not None
-        and is_same_place(
-            PhotoLocation(first.latitude, first.longitude, None),
-            PhotoLocation(r.location.latitude, r.location.longitude, None),
-            radius_m,
-        )
+        if (away_m := distance_between_m(first, r.location)) is not None and away_m <= radius_m
     ]
     weights = np.array([r.score - last_score for r in nearby]) + 1e-9
     latitude, longitude = weighted_centroid(

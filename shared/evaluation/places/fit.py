@@ -197,14 +197,11 @@ def _level_table(
     )
 
 
-def missing_place_table(samples: Sequence[PlaceSample]) -> RegressionTable:
-    """Return the samples of a missing place, half of them impostors by weight."""
-    return _impostor_table(samples, lambda levels: levels[0].features)
-
-
-def _impostor_table(
-    samples: Sequence[PlaceSample], describe: Callable[[Sequence[CandidateLevel]], FloatArray]
+def missing_place_table(
+    samples: Sequence[PlaceSample],
+    describe: Callable[[Sequence[CandidateLevel]], FloatArray] = lambda levels: levels[0].features,
 ) -> RegressionTable:
+    """Return the samples of a missing place, half of them impostors by weight."""
     samples = [s for s in samples if s.left_out is not None or not s.is_alone]
     return RegressionTable.of_rows(
         (describe(sample.levels), sample.left_out is not None, weight)
@@ -221,9 +218,9 @@ def _fit_elsewhere(samples: Sequence[PlaceSample], scores: MapScores) -> Elsewhe
     """
     prior = shipped_prior()
     if scores.extractor and (known := prior.elsewhere.get(scores.extractor)):
-        return known
-    other = prior.elsewhere[""].model_copy(update={"background": scores.background})
-    table = _impostor_table(samples, other.features)
+        return known.of_map(scores.background)
+    other = prior.elsewhere[""].of_map(scores.background)
+    table = missing_place_table(samples, other.features)
     if not 0 < table.target.sum() < len(table.target):
         return other
     plain = PlacePrior(means=(), scales=(), level=(), missing_place=())

@@ -326,8 +326,7 @@ def level_features(
             neighbours_inside.mean(),
             *shared,
         ]
-    else:
-        features += [0.0] * (len(FEATURES) - len(features))
+    features += [0.0] * (len(FEATURES) - len(features))
     return np.array(features, dtype=np.float64)
 
 

@@ -69,19 +69,29 @@ Coefficients = tuple[float, ...]
 
 
 class Background(BaseModel):
-    """Mean and standard deviation of the scores of photos of a map with each other."""
+    """Scores and matches of random pairs of photos of a map."""
 
     model_config = ConfigDict(frozen=True)
 
     mean: float
     deviation: float
+    usual_deviation: float = 0.0
+    """half the distance of the quantiles 0.16 and 0.84: few pairs show one place"""
+    support: float = 0.0
+    """`match_support` that one in ten pairs exceeds"""
 
     @classmethod
-    def of(cls, scores: Sequence[float]) -> Background:
-        """Return those of the scores of random pairs of photos."""
+    def of(cls, scores: Sequence[float], supports: Sequence[float] = ()) -> Background:
+        """Return those of the scores and the match supports of random pairs of photos."""
         if not scores:
             return cls(mean=0.0, deviation=1.0)
-        return cls(mean=float(np.mean(scores)), deviation=max(MIN_SPREAD, float(np.std(scores))))
+        low, high = np.quantile(scores, [0.16, 0.84])
+        return cls(
+            mean=float(np.mean(scores)),
+            deviation=max(MIN_SPREAD, float(np.std(scores))),
+            usual_deviation=float(high - low) / 2,
+            support=float(np.quantile(supports, 0.9)) if len(supports) else 0.0,
+        )
 
 
 class Elsewhere(BaseModel):
@@ -110,6 +120,19 @@ class Elsewhere(BaseModel):
         described = np.array([similarity, excess, np.log1p(largest)])
         return described if len(of_matches) else described[:2]
 
+    def of_map(self, pairs: Background) -> Elsewhere:
+        """Return those of a map, all of whose photos may show the same thing, such as a vehicle.
+
+        Without matches, the unit is that of the map's random pairs if it is larger. If their
+        matches alone would say that they show one place, matches do not count.
+        """
+        unit, (intercept, *slopes) = self.background or pairs, self.coefficients
+        ratio = unit.deviation / max(unit.deviation, pairs.usual_deviation)
+        plain = (intercept, *(ratio * slope for slope in slopes))
+        alike = self.matched[0] + self.matched[-1] * np.log1p(pairs.support) < np.log(0.05 / 0.95)
+        matched = (*plain, 0.0) if alike else self.matched
+        return Elsewhere(coefficients=plain, matched=matched, background=unit)
+
     def probability(self, levels: Sequence[CandidateLevel], share: float) -> float:
         """Return the probability that a query is from elsewhere, with the prior `share`."""
         features = self.features(levels)
@@ -124,7 +147,7 @@ class MapExtent(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     diameter_m: float | None = None
-    """distance that no two photos exceed; None without coordinates"""
+    """distance that no two photos exceed; None if a photo has no coordinates"""
     place: str | None = None
     """finest level of labels that all photos share"""
 
@@ -140,7 +163,7 @@ class MapExtent(BaseModel):
             if spot.latitude is not None and spot.longitude is not None
         ]
         diameter_m = None
-        if points:
+        if points and len(points) == len(locations):
             latitudes, longitudes = np.array(points).T
             longitudes = (longitudes - longitudes[0] + 180) % 360  # both sides of the antimeridian
             north, east = ((each.min() + each.max()) / 2 for each in (latitudes, longitudes))
@@ -150,19 +173,16 @@ class MapExtent(BaseModel):
 
     def end_levels(self, levels: Sequence[CandidateLevel]) -> list[CandidateLevel]:
         """Return the levels that are smaller than the map, and as the last one the whole map."""
-        finest_m, largest_m = levels[0].radius_m, levels[-1].radius_m
-        radius_m = finest_m and max(finest_m, self.diameter_m or largest_m or 0.0)
-        whole = replace(
-            levels[-1],
-            place=self.place if radius_m is None else None,
-            radius_m=radius_m,
-            is_whole_map=True,
-        )
-        labels = [level.place for level in levels]
-        if radius_m is not None:
+        finest_m, labels = levels[0].radius_m, [level.place for level in levels]
+        whole = replace(levels[-1], is_whole_map=True)
+        if finest_m is not None and self.diameter_m is not None:
+            radius_m = max(finest_m, self.diameter_m)
+            whole = replace(whole, radius_m=radius_m)
             smaller = [level for level in levels if (level.radius_m or 0.0) < radius_m]
-        else:
-            smaller = list(levels[: labels.index(self.place)] if self.place in labels else levels)
+        else:  # a photo without coordinates may be anywhere
+            whole = replace(whole, place=self.place, latitude=None, longitude=None, radius_m=None)
+            end = labels.index(self.place) if self.place and self.place in labels else None
+            smaller = list(levels[:end])
         return [*smaller, whole]
 
 
@@ -222,11 +242,6 @@ class PlaceEstimate:
     radius_95_m: float | None
     match_probabilities: Sequence[float]
     """for each photo of the ranking: that it shows the query's place, at the finest level"""
-
-    @property
-    def is_probable(self) -> bool:
-        """Whether a level is the answer, or one that is smaller than the map is probable."""
-        return self.answer is not None or max(self.probabilities[:-1], default=0.0) >= 0.5
 
 
 class PlaceModel(BaseModel):
@@ -347,7 +362,7 @@ class PlaceModel(BaseModel):
         finest = estimate.levels[0]
         if score < COPY_SCORE and score - finest.best_score > (self.spread or math.inf):
             return True
-        if estimate.is_probable:
+        if estimate.answer is not None or max(estimate.probabilities[:-1], default=0.0) >= 0.5:
             return False
         unmatched = finest.features[: len(FEATURES)]
         as_best = replace(finest, best_score=score, features=unmatched)

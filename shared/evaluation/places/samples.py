@@ -82,11 +82,10 @@ class OwnPhotoSampler:
         self._is_copy = is_copy
         self._rankings: dict[int, IndexRanking | None] = {}
         self._known = np.array([spot.is_known for spot in locations], dtype=bool)
-        self._latitudes = np.array([_or_nan(spot.latitude) for spot in locations])
-        self._longitudes = np.array([_or_nan(spot.longitude) for spot in locations])
-        self._seconds = np.array(
-            [_or_nan(None if t is None else t.timestamp()) for t in captured_at]
-        )
+        # None becomes NaN.
+        self._latitudes = np.array([spot.latitude for spot in locations], dtype=np.float64)
+        self._longitudes = np.array([spot.longitude for spot in locations], dtype=np.float64)
+        self._seconds = np.array([t and t.timestamp() for t in captured_at], dtype=np.float64)
         paths = [label_levels(spot.place, scheme.labels_are_paths) for spot in locations]
         depth = max(map(len, paths), default=0)
         self._labels = [
@@ -197,10 +196,8 @@ class OwnPhotoSampler:
                 yield f"level {position}", labels == labels[photo]
 
     def _away_m(self, photo: int) -> NDArray[np.float64]:
-        spot = self._locations[photo]
-        if spot.latitude is None or spot.longitude is None:
-            return np.full(len(self._locations), np.inf)
-        away = distances_m(spot.latitude, spot.longitude, self._latitudes, self._longitudes)
+        spot = self._latitudes[photo], self._longitudes[photo]
+        away = distances_m(*spot, self._latitudes, self._longitudes)
         return np.where(np.isnan(away), np.inf, away)
 
 
@@ -211,7 +208,3 @@ def attach_matches(
     support = match([r.photo for r in ranking[:MATCHED_PHOTOS]])
     first = [replace(r, support=s) for r, s in zip(ranking, support, strict=False)]
     return [*first, *ranking[len(first) :]]
-
-
-def _or_nan(value: float | None) -> float:
-    return np.nan if value is None else value

@@ -90,15 +90,13 @@ def choose_threshold(estimates: Sequence[HeldOutEstimate], certainty: float) -> 
     """
     # The last level, the whole map, is no answer to where.
     depth = max([1, *(len(s.probabilities) - 1 for s in estimates)])
-    probabilities = np.full((len(estimates), depth), -1.0)
-    known = np.zeros((len(estimates), depth))
-    wrong = np.zeros((len(estimates), depth))
+    table = np.full((3, len(estimates), depth), -1.0)
     for row, estimate in enumerate(estimates):
-        finer = len(estimate.probabilities) - 1
-        probabilities[row, :finer] = estimate.probabilities[:finer]
-        for position, right in enumerate(estimate.is_right[:finer]):
-            known[row, position] = 0.0 if right is None else estimate.weight
-            wrong[row, position] = estimate.weight if right is False else 0.0
+        levels = zip(estimate.probabilities[:-1], estimate.is_right, strict=False)
+        for position, (stated, right) in enumerate(levels):
+            table[:, row, position] = stated, right is not None, right is False
+    table[1:] *= np.array([estimate.weight for estimate in estimates])[:, None]
+    probabilities, known, wrong = table
     floor = max(0.5, 1 - MAX_ERROR_FACTOR * (1 - certainty))
     unseen = max(floor, 2 * certainty - 1)
     distinct = np.unique(probabilities[probabilities >= floor])
@@ -107,8 +105,8 @@ def choose_threshold(estimates: Sequence[HeldOutEstimate], certainty: float) -> 
     for candidate, more in [*((each, 1.0) for each in tried), (unseen, 0.0)]:
         reached = probabilities >= candidate
         answered = np.flatnonzero(reached.any(axis=1))
-        position = reached.argmax(axis=1)[answered]
-        mistaken, judged = wrong[answered, position].sum(), known[answered, position].sum()
+        finest = reached.argmax(axis=1)[answered]
+        mistaken, judged = wrong[answered, finest].sum(), known[answered, finest].sum()
         if mistaken + more <= (1 - certainty) * (judged + more) + 1e-9:
             return min(candidate, unseen) if candidate in tried[:1] else candidate
     return certainty

@@ -147,7 +147,7 @@ def test_circles_are_the_levels_of_coordinates(service: Service) -> None:
     service.upload(photo_bytes(0), latitude=45.0, longitude=7.0, place="here")
     service.upload(photo_bytes(1), latitude=46.0, longitude=7.0)
     service.drain()
-    fit(service)
+    fit(service, extent={"diameter_m": 2000})
     estimate = ask(service, 0)["estimate"]
     assert [level["radius_m"] for level in estimate["levels"]] == [25, 100, 500, 2000]
     assert {(level["latitude"], level["longitude"]) for level in estimate["levels"]} == {

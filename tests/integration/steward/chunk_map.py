@@ -84,10 +84,7 @@ class ChunkMap:
             delete(self.catalog, self.map_id, photo_id)
 
     def merge(
-        self,
-        compact_chunks: int = MANY,
-        retries: ReadRetries | None = None,
-        chunk_rows: int = 1000,
+        self, compact_chunks: int = MANY, retries: ReadRetries | None = None, chunk_rows: int = 1000
     ) -> int:
         """One round of the steward's merging; how many chunks it has written or dropped."""
         settings = Settings(chunk_rows=chunk_rows)

@@ -136,8 +136,7 @@ def queried_photos(city: EvaluatedMap, **params: Any) -> list[UUID]:
 
 
 @pytest.mark.parametrize(
-    ("later", "same"),
-    [(11.9 * HOUR, True), (-11.9 * HOUR, True), (12 * HOUR, False)],
+    ("later", "same"), [(11.9 * HOUR, True), (-11.9 * HOUR, True), (12 * HOUR, False)]
 )
 def test_queries_of_the_session_of_their_match_refine_no_probability(
     city: EvaluatedMap, later: timedelta, same: bool

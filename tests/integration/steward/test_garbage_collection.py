@@ -23,12 +23,7 @@ from shared.catalog.photos import Photo, get_photo
 from shared.catalog.reconstructions import Reconstruction
 from shared.jobs import Job, JobKind, JobState
 from shared.storage import FolderStore
-from shared.storage.keys import (
-    preview_key,
-    query_key,
-    query_vector_key,
-    thumbnail_key,
-)
+from shared.storage.keys import preview_key, query_key, query_vector_key, thumbnail_key
 from tests.integration.steward.chunk_map import HOUR_SECONDS, ChunkMap
 from tests.integration.steward.test_compaction import sum_of
 from tests.support.catalog_rows import (

@@ -79,8 +79,19 @@ def test_photos_without_features_leave_it_open(city: EvaluatedMap) -> None:
     assert generation(city).uses_matches is None
 
 
+@pytest.mark.parametrize("scenes", [FEW_PLACES, 1])
+def test_an_evaluation_measures_how_well_random_pairs_of_photos_match(
+    city: EvaluatedMap, scenes: int
+) -> None:
+    publish_clustered(city, FEW_PLACES, scenes=scenes)
+    set_matching(city, Matching.ON)
+    city.figures()
+    background = model(city).model_dump()["elsewhere"]["background"]
+    assert (background["support"] > 20) == (scenes == 1)
+
+
 def publish_clustered(
-    city: EvaluatedMap, places: int = PLACES, *, with_features: bool = True
+    city: EvaluatedMap, places: int = PLACES, *, with_features: bool = True, scenes: int = PLACES
 ) -> None:
     """Photos of places at angles that overlap, with the points of their places."""
     rng = np.random.default_rng(0)
@@ -92,5 +103,7 @@ def publish_clustered(
         seen.append((angle, at(place, filename=f"{walk}{place}.jpg")))
     ids = city.publish(seen)
     if with_features:
-        scenes = {photo_id: features_of(n // PER_PLACE, n) for n, photo_id in enumerate(ids)}
-        add_features(city.catalog, city.store, scenes)
+        features = {
+            photo_id: features_of(n // PER_PLACE % scenes, n) for n, photo_id in enumerate(ids)
+        }
+        add_features(city.catalog, city.store, features)

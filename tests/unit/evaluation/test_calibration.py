@@ -7,11 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as some
 
 from shared.evaluation.calibration import expected_calibration_error
-from shared.evaluation.places.evidence import (
-    PhotoLocation,
-    distance_between_m,
-    is_same_place,
-)
+from shared.evaluation.places.evidence import PhotoLocation, distance_between_m, is_same_place
 
 YES, NO = True, False
 

@@ -10,11 +10,7 @@ from hypothesis import strategies as st
 
 from services.gateway.similarity.estimate import estimate_place, locate_hits, place_at_pose
 from shared.catalog.photos import Photo
-from shared.evaluation.places.evidence import (
-    PhotoLocation,
-    RankedPhoto,
-    estimate_location,
-)
+from shared.evaluation.places.evidence import PhotoLocation, RankedPhoto, estimate_location
 from shared.evaluation.places.levels import CandidateLevel, LevelScheme
 from shared.evaluation.places.probability import (
     Background,

@@ -69,9 +69,7 @@ def test_a_user_of_the_proxy_has_the_scopes_of_the_groups(
     assert call(sign_in, peer, USER, ("X-Forwarded-Groups", "chiefs")).scopes == ALL_SCOPES
 
 
-def test_a_user_without_the_scope_gets_the_setting_that_grants_it(
-    sign_in: Authenticator,
-) -> None:
+def test_a_user_without_the_scope_gets_the_setting_that_grants_it(sign_in: Authenticator) -> None:
     app = FastAPI()
     install_exception_handlers(app)
     app.add_middleware(AuthenticationMiddleware, authenticator=sign_in)
@@ -111,9 +109,7 @@ def test_a_repeated_empty_or_long_user_header_is_refused(
     assert code(sign_in, PROXY, *headers) == "proxy_user_invalid"
 
 
-def test_pages_of_other_origins_can_not_use_the_cookie_of_the_proxy(
-    sign_in: Authenticator,
-) -> None:
+def test_pages_of_other_origins_can_not_use_the_cookie_of_the_proxy(sign_in: Authenticator) -> None:
     assert code(sign_in, PROXY, USER, ("Origin", "https://evil.example")) == "foreign_page"
     assert call(sign_in, PROXY, USER, ("Origin", "https://places.example")).identity == "user ada"
 

@@ -113,9 +113,7 @@ def test_the_page_has_its_url_as_a_qr_code(page: TestClient) -> None:
         assert page.get("/console/qr.svg", params={"url": refused}).status_code == 422
 
 
-def test_the_content_security_policy_names_the_tile_server(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_content_security_policy_names_the_tile_server(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MAP_TILES", TILES)
     monkeypatch.setenv("MAP_ATTRIBUTION", "© somebody")
     page = served(Settings())

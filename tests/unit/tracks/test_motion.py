@@ -53,11 +53,7 @@ def test_the_state_of_a_frame_is_at_its_pose_unless_the_track_is_elsewhere() -> 
 
     def pose(east_m: float) -> PositionFix:
         return PositionFix(
-            latitude=0.0,
-            longitude=east_m * degrees,
-            accuracy_m=0.3,
-            radius_95_m=0.7,
-            heading=92.5,
+            latitude=0.0, longitude=east_m * degrees, accuracy_m=0.3, radius_95_m=0.7, heading=92.5
         )
 
     there = track_state_response(state, pose(52))

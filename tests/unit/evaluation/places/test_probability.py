@@ -41,11 +41,7 @@ from shared.evaluation.places.probability import (
     shipped_prior,
 )
 from shared.evaluation.places.samples import IndexRanking, OwnPhotoSampler
-from shared.evaluation.places.thresholds import (
-    CERTAINTIES,
-    HeldOutEstimate,
-    choose_threshold,
-)
+from shared.evaluation.places.thresholds import CERTAINTIES, HeldOutEstimate, choose_threshold
 from shared.geodesy import distance_m
 from shared.place_paths import is_within_level, label_levels, look_like_paths
 
@@ -328,6 +324,35 @@ def test_the_whole_map_is_named_by_the_label_that_all_photos_share() -> None:
     ]  # fmt: skip
 
 
+def test_a_map_with_a_photo_that_has_no_coordinates_has_no_radius() -> None:
+    extent = MapExtent.of([north(0), north(10), label("hall")], PLAIN)
+    circles = [CandidateLevel(latitude=45.0, longitude=7.0, radius_m=r) for r in (25.0, 100.0)]
+    levels = extent.end_levels(circles)
+    assert [(level.latitude, level.radius_m, level.is_whole_map) for level in levels] == [
+        (45.0, 25.0, False), (45.0, 100.0, False), (None, None, True),
+    ]  # fmt: skip
+
+
+def matched_level(support: float) -> list[CandidateLevel]:
+    features = np.append(np.zeros(len(FEATURES)), [support / 100, 0, 0, 0, 0])
+    return [replace(of_score(0.12)[0], features=features)]
+
+
+def test_what_all_photos_of_a_map_show_does_not_say_that_it_has_a_place() -> None:
+    """Such as the vehicle that the camera is mounted on, or the black around a round picture."""
+    known = shipped_prior().elsewhere["efficientnet-lite0-vlad128"]
+    ordinary = known.of_map(Background.of([-0.04, 0.04] * 50, [8.0] * 95 + [300.0] * 5))
+    assert ordinary == known
+    of_vehicle = known.of_map(Background.of([-0.04, 0.04] * 50, [8.0] * 60 + [300.0] * 40))
+    assert of_vehicle.probability(matched_level(300.0), 0.33) == pytest.approx(
+        known.probability(of_score(0.12), 0.33)
+    )
+    of_round_pictures = known.of_map(Background.of([-0.086, 0.086] * 50))
+    assert of_round_pictures.probability(of_score(0.2), 0.33) == pytest.approx(
+        known.probability(of_score(0.1), 0.33)
+    )
+
+
 def test_the_more_similar_the_best_photo_and_the_less_its_rivals_the_less_is_it_elsewhere() -> None:
     known = shipped_prior().elsewhere["efficientnet-lite0-vlad128"]
     by_score = [known.probability(of_score(score), 0.33) for score in (0.03, 0.1, 0.15, 0.3)]
@@ -336,14 +361,8 @@ def test_the_more_similar_the_best_photo_and_the_less_its_rivals_the_less_is_it_
     assert by_score[-1] < 0.01
     by_rivals = [known.probability(of_score(0.12, rival), 0.33) for rival in (0.0, 0.1, 0.2)]
     assert by_rivals == sorted(by_rivals)
-    matched = [
-        replace(
-            of_score(0.12)[0],
-            features=np.append(np.zeros(len(FEATURES)), [support / 100, 0, 0, 0, 0]),
-        )
-        for support in (5.0, 10.0, 100.0)
-    ]
-    by_matches = [known.probability([level], 0.33) for level in matched]
+    matched = [matched_level(support) for support in (5.0, 10.0, 100.0)]
+    by_matches = [known.probability(level, 0.33) for level in matched]
     assert by_matches == sorted(by_matches, reverse=True)
     assert by_matches[-1] < 0.01
 
@@ -515,13 +534,7 @@ def test_model_knows_how_often_a_place_that_it_lacks_is_taken_for_one_that_looks
 
 
 @pytest.mark.parametrize(
-    ("places", "per_place", "noise"),
-    [
-        (40, 5, 0.6),
-        (20, 3, 0.6),
-        (4, 5, 0.3),
-        (1, 60, 1.0),
-    ],
+    ("places", "per_place", "noise"), [(40, 5, 0.6), (20, 3, 0.6), (4, 5, 0.3), (1, 60, 1.0)]
 )
 def test_probabilities_hold_in_maps_of_any_size_if_so_many_queries_are_from_elsewhere(
     places: int, per_place: int, noise: float
