@@ -13,12 +13,7 @@ from typing import Any, BinaryIO
 
 import httpx2
 
-from shared.errors import (
-    InvalidRequest,
-    PlacewiseError,
-    TooManyRequests,
-    error_from_response,
-)
+from shared.errors import InvalidRequest, PlacewiseError, TooManyRequests, error_from_response
 
 API = "/api/v1"
 IDEMPOTENCY_KEY = "Idempotency-Key"

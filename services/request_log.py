@@ -14,16 +14,8 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from shared.errors import Unavailable
-from shared.http.problem_details import (
-    CLIENT_GONE,
-    REQUEST_ID_SCOPE_KEY,
-    problem_response,
-)
-from shared.telemetry.request_ids import (
-    REQUEST_ID_HEADER,
-    request_id_context,
-    request_id_or_new,
-)
+from shared.http.problem_details import CLIENT_GONE, REQUEST_ID_SCOPE_KEY, problem_response
+from shared.telemetry.request_ids import REQUEST_ID_HEADER, request_id_context, request_id_or_new
 
 log = logging.getLogger(__name__)
 

@@ -30,12 +30,7 @@ import typer
 from sqlalchemy import select
 
 import placewise
-from lab.benchmarks.load_generator import (
-    make_jpegs,
-    multipart_forms,
-    upload_all,
-    wait_for_jobs,
-)
+from lab.benchmarks.load_generator import make_jpegs, multipart_forms, upload_all, wait_for_jobs
 from lab.benchmarks.report import Report, integers_option, printed_report
 from services.cli import main
 from services.cli.output import JsonOption

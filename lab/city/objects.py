@@ -9,14 +9,7 @@ from PIL import Image, ImageDraw
 
 from lab.city.camera import Floats
 from lab.city.raster import Quad, Texture
-from lab.city.textures import (
-    CODE_FLAT,
-    CODE_LAMP,
-    Colour,
-    colour_of,
-    painted,
-    random_stream,
-)
+from lab.city.textures import CODE_FLAT, CODE_LAMP, Colour, colour_of, painted, random_stream
 
 PIXELS_PER_METRE = 40
 FOLIAGE = ("spring", "summer", "autumn", "bare")

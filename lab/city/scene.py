@@ -15,13 +15,7 @@ from PIL import Image
 
 from lab.city.camera import Camera, Floats, cast_rays
 from lab.city.houses import PIXELS_PER_METRE, draw_house, make_house_style
-from lab.city.objects import (
-    LAMP_M,
-    PAINTS,
-    UP,
-    VEHICLE_SHARES,
-    make_object_style,
-)
+from lab.city.objects import LAMP_M, PAINTS, UP, VEHICLE_SHARES, make_object_style
 from lab.city.raster import SUPERSAMPLING, Canvas, Quad, Texture
 from lab.city.sessions import CaptureSession
 from lab.city.streets import PAVEMENT_M, Quarter, Street

@@ -6,12 +6,7 @@ import math
 from dataclasses import dataclass
 from datetime import datetime
 
-from shared.utm_filenames import (
-    FIELDS,
-    bad_coordinates_error,
-    parse_full_date,
-    utm_to_degrees,
-)
+from shared.utm_filenames import FIELDS, bad_coordinates_error, parse_full_date, utm_to_degrees
 
 
 @dataclass(frozen=True, slots=True)

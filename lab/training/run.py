@@ -11,17 +11,8 @@ from typing import Any
 from lightning.fabric import seed_everything
 
 from lab.evaluation.ranking import RecallEvaluation
-from lab.training.arguments import (
-    TrainingArguments,
-    combine_obstacles,
-    save_yaml,
-    to_plain_dict,
-)
-from lab.training.data import (
-    EvaluationSets,
-    select_evaluation_sets,
-    select_training_set,
-)
+from lab.training.arguments import TrainingArguments, combine_obstacles, save_yaml, to_plain_dict
+from lab.training.data import EvaluationSets, select_evaluation_sets, select_training_set
 from lab.training.model_factory import make_model, register_own_modules
 from lab.training.resolve import (
     check_environment,

@@ -27,13 +27,7 @@ from lab.training.checkpointing import (
     restore_rng_state,
     rng_state,
 )
-from lab.training.data import (
-    Batch,
-    PhotoTransform,
-    PlaceBatchSampler,
-    PlaceDataset,
-    load_batches,
-)
+from lab.training.data import Batch, PhotoTransform, PlaceBatchSampler, PlaceDataset, load_batches
 from lab.training.losses import batch_accuracy, make_loss, make_miner
 from lab.training.resolve import portable_arguments
 from lab.training.run_control import Display, StopRequest

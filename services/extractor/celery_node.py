@@ -22,12 +22,7 @@ from kombu.connection import Connection
 
 from shared.catalog.jobs import EXTRACTOR_JOBS
 from shared.config.settings import Settings
-from shared.jobs.celery_messages import (
-    BROKER_ERRORS,
-    RETRY_SECONDS,
-    CeleryJobMessages,
-    open_redis,
-)
+from shared.jobs.celery_messages import BROKER_ERRORS, RETRY_SECONDS, CeleryJobMessages, open_redis
 from shared.jobs.wakeups import WakeupQueue, task_name
 
 log = logging.getLogger(__name__)

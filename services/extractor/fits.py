@@ -33,12 +33,7 @@ from shared.catalog.tables import open_catalog
 from shared.catalog.vocabularies import VocabularyOrigin, get_pca_source_generation
 from shared.config.settings import Settings, usable_processors
 from shared.descriptors.patches import fit_vocabulary, sample_photos
-from shared.descriptors.pca_fit import (
-    check_pca_fittable,
-    fit_pca_stream,
-    sample_rows,
-    sample_size,
-)
+from shared.descriptors.pca_fit import check_pca_fittable, fit_pca_stream, sample_rows, sample_size
 from shared.descriptors.pca_whitening import PcaProjection, PcaWhitening, PcaWhiteningFile, Rows
 from shared.descriptors.vocabulary_file import VocabularyFile
 from shared.errors import Conflict, NotFound, PlacewiseError, Unprocessable

@@ -23,11 +23,7 @@ from shared.catalog.vocabularies import (
 from shared.descriptors.extractor import Extractor
 from shared.descriptors.pca_whitening import PcaWhiteningFile, decode_whitening
 from shared.descriptors.vocabulary import encode_centres
-from shared.descriptors.vocabulary_file import (
-    Provenance,
-    check_vocabulary_fits,
-    decode_vocabulary,
-)
+from shared.descriptors.vocabulary_file import Provenance, check_vocabulary_fits, decode_vocabulary
 from shared.errors import Unprocessable
 from shared.jobs import Job, JobKind
 from shared.jobs.leases import lock_leased_job

@@ -16,13 +16,7 @@ from numpy.typing import NDArray
 from services.search.dense_scan import QueryRow, scan_top_k
 from services.search.query_batcher import QueryBatcher
 from services.search.snapshot import Snapshot
-from shared.search_api.protocol import (
-    EXHAUSTIVE,
-    NONE,
-    STATISTICAL,
-    SearchHit,
-    SearchResponse,
-)
+from shared.search_api.protocol import EXHAUSTIVE, NONE, STATISTICAL, SearchHit, SearchResponse
 
 # Largest plausible error in standard deviations (exceeded by one row in ten million); beyond it
 # the sign codes are not trusted.

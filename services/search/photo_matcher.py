@@ -21,12 +21,7 @@ from shared.matching.features import MIN_SIDE, LocalFeatures
 from shared.matching.mutual_nearest import match_keypoints
 from shared.matching.verification import verify_matches
 from shared.responses.similarity import PointPair
-from shared.search_api.protocol import (
-    FeatureReference,
-    MatchRequest,
-    MatchResponse,
-    PhotoMatches,
-)
+from shared.search_api.protocol import FeatureReference, MatchRequest, MatchResponse, PhotoMatches
 from shared.storage import ObjectStore
 from shared.storage.feature_files import FeatureIndex, read_feature_index
 from shared.storage.keys import QUERIES

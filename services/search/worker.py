@@ -26,11 +26,7 @@ from services.search.catalog_sync import (
     read_generation_versions,
     sync_snapshot,
 )
-from services.search.chunk_loader import (
-    MemoryBudget,
-    list_generation_folders,
-    remove_stale_folders,
-)
+from services.search.chunk_loader import MemoryBudget, list_generation_folders, remove_stale_folders
 from services.search.executor import execute_query
 from services.search.photo_columns import build_row_mask
 from services.search.photo_matcher import PhotoMatcher

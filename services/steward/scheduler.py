@@ -24,11 +24,7 @@ import services.steward.tasks.model_changes
 import services.steward.tasks.reindex_jobs  # noqa: F401  (they register their tasks)
 from services.steward.metrics import StewardMetrics
 from services.steward.periodic_tasks import PeriodicTask, registered_tasks
-from services.steward.tasks.orphans import (
-    CollectionHeld,
-    collect_orphans,
-    empty_expired_trash,
-)
+from services.steward.tasks.orphans import CollectionHeld, collect_orphans, empty_expired_trash
 from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.session import IDLE_SECONDS, Catalog, ChangePoll
 from shared.config.settings import Settings

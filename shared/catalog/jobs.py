@@ -45,10 +45,7 @@ from shared.catalog.database.base import (
     partial_index,
 )
 from shared.enums import JobState as JobState
-from shared.telemetry.request_ids import (
-    MAX_REQUEST_ID_CHARACTERS,
-    current_request_id,
-)
+from shared.telemetry.request_ids import MAX_REQUEST_ID_CHARACTERS, current_request_id
 
 UNFINISHED_STATES = (JobState.QUEUED, JobState.RUNNING)
 

@@ -39,12 +39,7 @@ from shared.catalog.database.base import (
     get_or_insert,
     insert_row,
 )
-from shared.catalog.generations import (
-    Generation,
-    GenerationState,
-    RowType,
-    active_generation,
-)
+from shared.catalog.generations import Generation, GenerationState, RowType, active_generation
 from shared.catalog.jobs import Job
 from shared.catalog.photos import (
     Photo,

@@ -24,13 +24,7 @@ from sqlalchemy import String, and_, delete, or_, select, update
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.database.base import (
-    Entity,
-    JsonValue,
-    UtcDateTime,
-    db_now,
-    db_now_plus,
-)
+from shared.catalog.database.base import Entity, JsonValue, UtcDateTime, db_now, db_now_plus
 from shared.catalog.database.errors import OutageLog
 from shared.catalog.database.session import Catalog
 from shared.ids import new_id

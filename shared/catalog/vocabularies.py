@@ -21,10 +21,7 @@ from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import Map
 from shared.enums import VocabularyOrigin as VocabularyOrigin
 from shared.errors import Conflict, Misconfigured
-from shared.extractor_config.configs import (
-    MIN_PHOTOS_TO_FIT,
-    get_extractor_config,
-)
+from shared.extractor_config.configs import MIN_PHOTOS_TO_FIT, get_extractor_config
 
 
 class Vocabulary(Journaled, Entity):

@@ -16,11 +16,7 @@ from shared.extractor_config.configs import (
     add_extractor_options,
     get_extractor_config,
 )
-from shared.extractor_config.names import (
-    TORCHHUB_PREFIX,
-    TORCHSCRIPT_PREFIX,
-    parse_torchhub_name,
-)
+from shared.extractor_config.names import TORCHHUB_PREFIX, TORCHSCRIPT_PREFIX, parse_torchhub_name
 
 EXTRACTORS_BY_DINO_MODEL = {
     name.replace("anyloc-", "dinov2_"): name

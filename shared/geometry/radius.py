@@ -10,13 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from shared.geometry.cameras import CameraSource, Floats
 from shared.geometry.component import quaternion_of
-from shared.geometry.frames import (
-    Attitude,
-    EastNorthUp,
-    Similarity,
-    attitude_of,
-    geopose_rotation,
-)
+from shared.geometry.frames import Attitude, EastNorthUp, Similarity, attitude_of, geopose_rotation
 from shared.geometry.localise import OTHER_LENS, LocalPose
 
 CAMERA_MODEL_SIGMA = 0.0025

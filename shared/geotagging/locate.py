@@ -19,11 +19,7 @@ from shared.geotagging.evidence import (
     interpolate_position,
 )
 from shared.geotagging.fusion import Proposal, propose_position
-from shared.responses.similarity import (
-    CameraPoseResponse,
-    EstimateResponse,
-    SimilarityResponse,
-)
+from shared.responses.similarity import CameraPoseResponse, EstimateResponse, SimilarityResponse
 from shared.tracks.motion import MotionModel
 
 SIMILAR_PHOTOS = 50

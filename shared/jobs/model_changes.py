@@ -26,13 +26,7 @@ from shared.catalog.generations import (
     active_generation,
     lock_generation,
 )
-from shared.catalog.jobs import (
-    MODEL_CHANGE_JOBS,
-    UNFINISHED_STATES,
-    Job,
-    JobKind,
-    WaitingFor,
-)
+from shared.catalog.jobs import MODEL_CHANGE_JOBS, UNFINISHED_STATES, Job, JobKind, WaitingFor
 from shared.catalog.maps import Matching, increment_map_version, lock_map
 from shared.catalog.photos import PhotoRole, count_live_photos
 from shared.errors import Conflict

@@ -12,13 +12,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from shared.catalog.database.base import count_rows, db_now, db_now_plus
-from shared.catalog.jobs import (
-    UNFINISHED_STATES,
-    Job,
-    JobKind,
-    Priority,
-    claimable_condition,
-)
+from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, Priority, claimable_condition
 from shared.catalog.maps import Map
 
 THROUGHPUT_WINDOW_SECONDS = 60.0

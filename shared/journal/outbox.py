@@ -13,11 +13,7 @@ from sqlalchemy.orm import Session
 
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.database.session import NO_TIMEOUTS, Catalog
-from shared.catalog.installation import (
-    Installation,
-    check_not_behind,
-    get_or_create_installation,
-)
+from shared.catalog.installation import Installation, check_not_behind, get_or_create_installation
 from shared.catalog.jobs import Job, JobKind, JobState
 from shared.journal.segments import (
     MIN_SEGMENTS_TO_MERGE,

@@ -19,11 +19,7 @@ from services.steward.tasks.model_changes import advance_model_changes
 from services.steward.tasks.reindex_jobs import QueuedChunks
 from shared.catalog.chunks import count_searchable
 from shared.catalog.database.session import Catalog
-from shared.catalog.generations import (
-    Generation,
-    GenerationState,
-    active_generation,
-)
+from shared.catalog.generations import Generation, GenerationState, active_generation
 from shared.catalog.jobs import UNFINISHED_STATES, get_job
 from shared.catalog.photos import Photo
 from shared.catalog.vocabularies import Vocabulary
@@ -38,13 +34,7 @@ from shared.jobs.model_changes import cancel_model_change, start_model_change
 from shared.storage import FolderStore
 from shared.storage.chunks import Rows
 from shared.storage.keys import TRASH
-from tests.support.catalog_rows import (
-    ask,
-    delete,
-    read_job,
-    stored_rows,
-    upload,
-)
+from tests.support.catalog_rows import ask, delete, read_job, stored_rows, upload
 from tests.support.photos import photo_bytes
 
 ROUNDS = 60  # of draining and stewarding, before a model change that does not end is a failure

@@ -21,11 +21,7 @@ from lab.datasets.ground_truth_files import read_ground_truth
 from lab.datasets.open_dataset import evaluation_set_names, open_evaluation_set
 from lab.evaluation.exact_knn import Rankings, exact_knn
 from lab.evaluation.places import measure_places
-from lab.evaluation.ranking import (
-    Rows,
-    describe_evaluation_set,
-    describe_to_matrix,
-)
+from lab.evaluation.ranking import Rows, describe_evaluation_set, describe_to_matrix
 from lab.evaluation.results import EvaluationResult, EvaluationRun, load_matrix, read_comparable_run
 from services.cli.environment import read_settings
 from services.cli.output import progress_bar, stage_bars

@@ -12,10 +12,7 @@ from rich.progress import Progress, TaskID
 from rich.table import Column
 
 from lab.cli.training.options import given_options, with_training_options
-from lab.training.arguments import (
-    build_arguments,
-    load_yaml,
-)
+from lab.training.arguments import build_arguments, load_yaml
 from services.cli.environment import require_packages
 from services.cli.output import (
     Json,

@@ -29,14 +29,7 @@ from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState
 from shared.errors import NotFound, Unavailable
 from shared.jobs.transitions import requeue_job
-from shared.journal.segments import (
-    SNAPSHOT_TABLES,
-    TABLES,
-    Line,
-    columns_of,
-    read_lines,
-    table_of,
-)
+from shared.journal.segments import SNAPSHOT_TABLES, TABLES, Line, columns_of, read_lines, table_of
 from shared.storage import ObjectStore
 from shared.storage.keys import ORIGINALS, is_original_key, reconstruction_prefix
 from shared.storage.segments import Segment, list_segments

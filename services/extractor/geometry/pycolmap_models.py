@@ -20,12 +20,7 @@ from numpy.typing import NDArray
 from services.extractor.geometry.matching import VerifiedMatches
 from shared.errors import Misconfigured, Unprocessable
 from shared.geometry.cameras import UNKNOWN_FOCAL_LENGTH, Camera, Floats, Rays
-from shared.geometry.component import (
-    NO_POINT,
-    Component,
-    bounded_inverse,
-    projection_jacobian,
-)
+from shared.geometry.component import NO_POINT, Component, bounded_inverse, projection_jacobian
 from shared.matching.features import WORKING_SIDE
 from shared.matching.verification import MAX_EPIPOLAR_ERROR_PIXELS
 

@@ -16,11 +16,7 @@ from services.gateway.authentication import READ
 from services.gateway.dependencies import ALL_MAPS, NO_PARAMETERS, GatewayContext, GatewayDep
 from shared.catalog.database.errors import to_unavailable
 from shared.catalog.jobs import is_job_overdue
-from shared.catalog.maps import (
-    Map,
-    count_failed_photos,
-    list_extractors_in_use,
-)
+from shared.catalog.maps import Map, count_failed_photos, list_extractors_in_use
 from shared.catalog.processes import PROCESS_TIMEOUT_SECONDS, list_processes
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, StorageFull, TooManyRequests

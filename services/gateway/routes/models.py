@@ -41,11 +41,7 @@ from shared.catalog.models import (
     remove_model,
 )
 from shared.errors import PlacewiseError, TooLarge
-from shared.extractor_config.names import (
-    MAX_NAME_CHARACTERS,
-    MODEL_NAME_PATTERN,
-    MODEL_NAME_RULE,
-)
+from shared.extractor_config.names import MAX_NAME_CHARACTERS, MODEL_NAME_PATTERN, MODEL_NAME_RULE
 from shared.jobs import Job, JobKind
 from shared.jobs.wakeups import JobMessage
 from shared.responses import ResponseModel

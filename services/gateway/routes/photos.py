@@ -35,13 +35,7 @@ from shared.catalog.database.base import insert_row
 from shared.catalog.generations import active_generation
 from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.maps import get_map, increment_map_version, lock_map
-from shared.catalog.photos import (
-    Photo,
-    PhotoRole,
-    find_same_photo,
-    get_photo,
-    mark_photo_deleted,
-)
+from shared.catalog.photos import Photo, PhotoRole, find_same_photo, get_photo, mark_photo_deleted
 from shared.errors import Conflict, NotFound
 from shared.http.request_model import RequestModel
 from shared.imaging.capture_place import MAX_ALTITUDE_M

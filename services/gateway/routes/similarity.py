@@ -36,14 +36,7 @@ from services.gateway.uploads.query_photo import (
 )
 from shared.catalog.jobs import QUERY_TTL_SECONDS, UNFINISHED_STATES, get_job
 from shared.catalog.maps import get_map
-from shared.errors import (
-    Conflict,
-    Gone,
-    NotFound,
-    Unavailable,
-    Unprocessable,
-    invalid_field_error,
-)
+from shared.errors import Conflict, Gone, NotFound, Unavailable, Unprocessable, invalid_field_error
 from shared.ids import new_id
 from shared.imaging.photo_header import read_photo_header
 from shared.ingest.validation import check_photo_signature

@@ -32,19 +32,11 @@ from services.gateway.dependencies import (
     parse_prefer_wait,
     wait_for_job,
 )
-from services.gateway.idempotency import (
-    IdempotentDep,
-    IdempotentFormDep,
-    IdempotentRequest,
-)
+from services.gateway.idempotency import IdempotentDep, IdempotentFormDep, IdempotentRequest
 from services.gateway.responses import accepted_headers, job_url, url_in_map
 from services.gateway.similarity.search_params import SearchParams
 from services.gateway.tracks.apply_frames import apply_pending_frames, smooth_states
-from services.gateway.tracks.schemas import (
-    FRAME_FIELDS,
-    FrameForm,
-    TrackParams,
-)
+from services.gateway.tracks.schemas import FRAME_FIELDS, FrameForm, TrackParams
 from services.gateway.uploads.multipart import FormFile, multipart_schema, parse_form
 from services.gateway.uploads.query_photo import describe_query_job, receive_query_photo
 from shared.catalog.database.base import insert_row

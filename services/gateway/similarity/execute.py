@@ -47,11 +47,7 @@ from shared.evaluation.places.evidence import EVIDENCE_DEPTH, RankedPhoto
 from shared.evaluation.places.levels import LevelScheme
 from shared.evaluation.places.probability import ELSEWHERE_SHARE, PlaceModel
 from shared.jobs import Job, JobState
-from shared.responses.similarity import (
-    EstimateResponse,
-    SimilarityResponse,
-    SimilarPhotoResponse,
-)
+from shared.responses.similarity import EstimateResponse, SimilarityResponse, SimilarPhotoResponse
 from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
 from shared.search_api.protocol import (
     FeatureReference,

@@ -47,13 +47,7 @@ from shared.responses.tracks import TrackStateResponse
 from shared.search_api.background import background_frames
 from shared.search_api.protocol import MAX_MATCHED_PHOTOS, RowReference, SearchHit
 from shared.tracks.belief import Belief
-from shared.tracks.evidence import (
-    HITS,
-    MAX_ACCURACY_M,
-    FrameEvidence,
-    PositionFix,
-    frame_evidence,
-)
+from shared.tracks.evidence import HITS, MAX_ACCURACY_M, FrameEvidence, PositionFix, frame_evidence
 from shared.tracks.filter import TrackFilter
 
 

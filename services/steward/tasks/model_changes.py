@@ -28,12 +28,7 @@ from services.steward.tasks.reindex_jobs import (
     queue_missing_photos,
     settle_photo_jobs,
 )
-from shared.catalog.chunks import (
-    MAX_EXACT_COUNT,
-    Descriptor,
-    count_searchable,
-    estimate_described,
-)
+from shared.catalog.chunks import MAX_EXACT_COUNT, Descriptor, count_searchable, estimate_described
 from shared.catalog.database.base import Condition, count_rows, db_now, db_now_plus
 from shared.catalog.database.session import Catalog
 from shared.catalog.generations import (

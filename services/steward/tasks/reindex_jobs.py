@@ -18,11 +18,7 @@ from services.steward.periodic_tasks import periodic_task
 from shared.catalog.chunks import IDS_PER_QUERY, Chunk, Descriptor, select_failed_photos
 from shared.catalog.database.base import affected_rows
 from shared.catalog.database.session import Catalog
-from shared.catalog.generations import (
-    Generation,
-    GenerationState,
-    active_generation,
-)
+from shared.catalog.generations import Generation, GenerationState, active_generation
 from shared.catalog.jobs import UNFINISHED_STATES, WaitingFor
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo

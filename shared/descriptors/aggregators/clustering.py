@@ -59,12 +59,7 @@ from pydantic import Field
 from torch import nn
 from torch.nn.functional import normalize, one_hot
 
-from shared.descriptors.aggregators.base import (
-    Aggregator,
-    Positive,
-    Size,
-    normalise_rows,
-)
+from shared.descriptors.aggregators.base import Aggregator, Positive, Size, normalise_rows
 
 
 def assign_clusters(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:

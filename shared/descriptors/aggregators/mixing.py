@@ -32,13 +32,7 @@ import torch
 from pydantic import Field
 from torch import nn
 
-from shared.descriptors.aggregators.base import (
-    Aggregator,
-    Layers,
-    Positive,
-    Size,
-    normalise_rows,
-)
+from shared.descriptors.aggregators.base import Aggregator, Layers, Positive, Size, normalise_rows
 
 
 class _FeatureMixer(nn.Module):

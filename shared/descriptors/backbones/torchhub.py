@@ -27,11 +27,7 @@ from urllib.error import URLError
 import httpx2
 import torch
 
-from shared.descriptors.backbones import (
-    NetworkBackbone,
-    StoredWeights,
-    find_descriptor_fault,
-)
+from shared.descriptors.backbones import NetworkBackbone, StoredWeights, find_descriptor_fault
 from shared.descriptors.weight_files import (
     OnProgress,
     download_file,

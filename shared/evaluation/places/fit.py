@@ -38,11 +38,7 @@ from shared.evaluation.places.probability import (
     shipped_prior,
     sigmoid,
 )
-from shared.evaluation.places.thresholds import (
-    CERTAINTIES,
-    HeldOutEstimate,
-    choose_threshold,
-)
+from shared.evaluation.places.thresholds import CERTAINTIES, HeldOutEstimate, choose_threshold
 
 MIN_OWN_PHOTOS = 20
 PRIOR_PRECISION = 2.0  # of each coefficient of a standardised feature

@@ -10,12 +10,8 @@ from shared.errors import Unprocessable
 from shared.jobs import Job
 from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.runner import reclaim_expired_leases
-from shared.jobs.transitions import (
-    succeed_job,
-)
-from tests.support.catalog_rows import (
-    add_job,
-)
+from shared.jobs.transitions import succeed_job
+from tests.support.catalog_rows import add_job
 
 PROBLEM = Unprocessable("undecodable_photo", "The photo can't be decoded.").as_problem()
 

@@ -17,12 +17,7 @@ from shared.errors import NotFound
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.claim import claim_jobs, fair_batch_size
 from tests.contract.jobs.jobs import ids, queue, token_of
-from tests.support.catalog_rows import (
-    add_generation,
-    add_map,
-    set_columns,
-    take,
-)
+from tests.support.catalog_rows import add_generation, add_map, set_columns, take
 from tests.support.threads import at_once
 
 

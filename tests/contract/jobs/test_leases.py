@@ -22,9 +22,7 @@ from shared.jobs import Job, JobKind, JobState
 from shared.jobs.claim import claim_jobs, mark_started
 from shared.jobs.leases import extend_lease, lock_leased_jobs, maintain_lease
 from shared.jobs.runner import MAX_ATTEMPTS, reclaim_expired_leases
-from shared.jobs.transitions import (
-    requeue_job,
-)
+from shared.jobs.transitions import requeue_job
 from tests.contract.jobs.jobs import end, free, ids, queue, token_of
 from tests.support.catalog_rows import (
     add_generation,

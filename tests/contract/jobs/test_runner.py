@@ -12,12 +12,7 @@ from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import Job, JobKind, JobState
 from shared.config.settings import Settings
 from shared.errors import Unavailable, Unprocessable
-from shared.jobs.runner import (
-    JobInterrupted,
-    JobRunner,
-    StepOutcome,
-    reclaim_expired_leases,
-)
+from shared.jobs.runner import JobInterrupted, JobRunner, StepOutcome, reclaim_expired_leases
 from tests.support.catalog_rows import add_job, add_map, read_job, take
 
 KINDS = (JobKind.INDEX, JobKind.DESCRIBE, JobKind.EVALUATE)

@@ -10,28 +10,12 @@ from shared.catalog.database.base import db_now
 from shared.catalog.database.session import Catalog
 from shared.catalog.jobs import MODEL_CHANGE_JOBS, WaitingFor, get_job
 from shared.errors import Conflict
-from shared.jobs import (
-    Job,
-    JobKind,
-    JobState,
-)
+from shared.jobs import Job, JobKind, JobState
 from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.runner import MAX_ATTEMPTS
-from shared.jobs.transitions import (
-    cancel_job,
-    fail_job,
-    retry_job,
-    succeed_job,
-)
+from shared.jobs.transitions import cancel_job, fail_job, retry_job, succeed_job
 from tests.contract.jobs.jobs import PROBLEM, end, ids, queue, token_of
-from tests.support.catalog_rows import (
-    add_job,
-    add_photo,
-    delete,
-    read_job,
-    states,
-    take,
-)
+from tests.support.catalog_rows import add_job, add_photo, delete, read_job, states, take
 
 
 def test_a_finished_job_can_not_be_cancelled(catalog: Catalog, map_id: UUID) -> None:

@@ -26,13 +26,7 @@ from shared.config.settings import Settings
 from shared.storage import FolderStore
 from shared.storage.chunks import decode_rows, manifest_key
 from tests.contract.search.search_methods import always_by_codes
-from tests.support.small_map import (
-    Reference,
-    Rows,
-    SmallMap,
-    assert_answers,
-    unit_rows,
-)
+from tests.support.small_map import Reference, Rows, SmallMap, assert_answers, unit_rows
 
 
 class AddDeleteMerge(RuleBasedStateMachine):

@@ -14,12 +14,7 @@ from shared.matching.features import LocalFeatures
 from shared.storage.chunks import features_key
 from shared.storage.keys import query_features_key
 from tests.integration.in_process_api import Service
-from tests.support.local_features import (
-    SIZE,
-    add_features,
-    put_features,
-    scene_features,
-)
+from tests.support.local_features import SIZE, add_features, put_features, scene_features
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 

@@ -26,12 +26,7 @@ from shared.catalog.photos import Photo
 from shared.catalog.reconstructions import ReconstructedComponent
 from shared.catalog.tracks import TrackFrame
 from shared.errors import NotFound, Unavailable, Unprocessable
-from shared.evaluation.places.probability import (
-    Background,
-    Elsewhere,
-    PlaceModel,
-    shipped_prior,
-)
+from shared.evaluation.places.probability import Background, Elsewhere, PlaceModel, shipped_prior
 from shared.geodesy import distance_m
 from shared.jobs import Job
 from shared.matching.features import FULL_SIDE, LocalFeatures

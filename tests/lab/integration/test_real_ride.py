@@ -11,11 +11,7 @@ import torch
 from PIL import Image
 
 from lab.datasets.open_dataset import open_evaluation_set
-from lab.evaluation.sequences import (
-    evaluate_sequence,
-    prepare_map,
-    sequence_figures,
-)
+from lab.evaluation.sequences import evaluate_sequence, prepare_map, sequence_figures
 from shared.descriptors.extractor import Extractor
 from shared.extractor_config.configs import get_extractor_config
 from shared.tracks.motion import MOTION_MODELS

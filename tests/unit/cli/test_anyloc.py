@@ -9,12 +9,7 @@ from typing import Any
 
 import pytest
 
-from services.cli.ingest.anyloc import (
-    AnylocPhotos,
-    AnylocRow,
-    read_anyloc_photos,
-    read_anyloc_rows,
-)
+from services.cli.ingest.anyloc import AnylocPhotos, AnylocRow, read_anyloc_photos, read_anyloc_rows
 from shared.errors import InvalidRequest
 from tests.support.anyloc import AnylocInstallation
 

@@ -14,14 +14,7 @@ from typer.testing import CliRunner
 
 from services.cli.export import app
 from shared.errors import Conflict, NotFound, PlacewiseError
-from tests.support.api_responses import (
-    GENERATION,
-    GENERATION_ID,
-    PHOTO,
-    PHOTO_ID,
-    SIMILAR,
-    STATS,
-)
+from tests.support.api_responses import GENERATION, GENERATION_ID, PHOTO, PHOTO_ID, SIMILAR, STATS
 from tests.support.archives import tar_of
 from tests.support.fake_server import FakeServer
 

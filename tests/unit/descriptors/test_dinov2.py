@@ -16,14 +16,7 @@ from torch.nn.modules.module import register_module_forward_hook
 
 from shared.descriptors.backbones.dinov2 import SHAPES, Dinov2, VitShape
 from shared.extractor_config.configs import EXTRACTOR_CONFIGS, FACETS
-from tests.support.vit import (
-    PLAIN,
-    SIDE,
-    SWIGLU,
-    WITH_REGISTERS,
-    random_weights,
-    save,
-)
+from tests.support.vit import PLAIN, SIDE, SWIGLU, WITH_REGISTERS, random_weights, save
 from tests.unit.descriptors.dinov2_reference import plain_forward
 
 pytestmark = pytest.mark.numerics

@@ -16,11 +16,7 @@ from PIL import Image
 
 from shared.descriptors.aggregators.clustering import soft_vlad, vlad
 from shared.descriptors.aggregators.pooling import average_pooling, gem_pooling
-from shared.descriptors.extractor import (
-    Extractor,
-    choose_device,
-    spec_fingerprint,
-)
+from shared.descriptors.extractor import Extractor, choose_device, spec_fingerprint
 from shared.descriptors.vocabulary import parse_centres
 from shared.errors import Misconfigured
 from shared.extractor_config.configs import EXTRACTOR_CONFIGS, get_extractor_config

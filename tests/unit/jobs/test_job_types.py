@@ -5,13 +5,7 @@ from __future__ import annotations
 import services.extractor.worker  # noqa: F401  (imports the modules that register handlers)
 from services.extractor.fits import FitWorker
 from services.extractor.handlers import HANDLERS
-from shared.catalog.jobs import (
-    DRAINED_JOBS,
-    FIT_WORKER_JOBS,
-    JOB_TYPES,
-    STATUS_PAGE_JOBS,
-    JobKind,
-)
+from shared.catalog.jobs import DRAINED_JOBS, FIT_WORKER_JOBS, JOB_TYPES, STATUS_PAGE_JOBS, JobKind
 
 
 def test_every_kind_of_job_has_a_type() -> None:

@@ -9,11 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from tests.lab.training_runs import (
-    run_arguments,
-    train,
-    write_tiny_places,
-)
+from tests.lab.training_runs import run_arguments, train, write_tiny_places
 
 Json = dict[str, Any]
 

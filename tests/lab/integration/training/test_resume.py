@@ -17,12 +17,7 @@ from lab.training.grid import GridPlan, run_grid
 from lab.training.run_control import NullDisplay, RunStopped, StopRequest
 from lab.training.run_folder import lock_folder
 from shared.errors import Conflict, PlacewiseError
-from tests.lab.training_runs import (
-    StopAfter,
-    assert_same_weights,
-    run_arguments,
-    write_tiny_places,
-)
+from tests.lab.training_runs import StopAfter, assert_same_weights, run_arguments, write_tiny_places
 from tests.lab.unit.data_sets import refused
 
 Json = dict[str, Any]

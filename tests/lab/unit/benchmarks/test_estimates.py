@@ -11,9 +11,7 @@ import pytest
 from rich.progress import Progress
 
 from lab.benchmarks import estimates
-from lab.benchmarks.estimates import (
-    DescribedPhotos,
-)
+from lab.benchmarks.estimates import DescribedPhotos
 from shared.errors import Misconfigured
 from shared.evaluation.places.evidence import PhotoLocation
 from shared.evaluation.places.levels import LevelScheme

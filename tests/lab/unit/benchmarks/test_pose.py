@@ -5,12 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.benchmarks.pose import (
-    MappedPhotos,
-    _align,
-    _judge,
-    measure_synthetic,
-)
+from lab.benchmarks.pose import MappedPhotos, _align, _judge, measure_synthetic
 from lab.benchmarks.report import Report
 from lab.city.round_trip import STEP_M, plan_round_trip
 from lab.city.sessions import NIGHT, SPRING

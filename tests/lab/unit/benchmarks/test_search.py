@@ -20,11 +20,7 @@ from lab.benchmarks.search import (
     placewise_search,
     same_ranking,
 )
-from lab.benchmarks.synthetic_map import (
-    SyntheticCity,
-    create_synthetic_map,
-    required_memory_bytes,
-)
+from lab.benchmarks.synthetic_map import SyntheticCity, create_synthetic_map, required_memory_bytes
 from services.cli.main import build_app
 from services.search.snapshot import Snapshot
 from services.search.worker import SearchWorker

@@ -12,14 +12,7 @@ import pytest
 
 from lab.training import run
 from lab.training.arguments import build_arguments, load_yaml, save_yaml, to_plain_dict
-from lab.training.grid import (
-    GridPlan,
-    PlannedRun,
-    RunState,
-    load_grid_plan,
-    load_outcome,
-    run_grid,
-)
+from lab.training.grid import GridPlan, PlannedRun, RunState, load_grid_plan, load_outcome, run_grid
 from lab.training.leaderboard import leaderboard, write_leaderboard
 from lab.training.run_control import Display, NullDisplay, RunStopped, StopRequest
 from shared.errors import Conflict, InvalidRequest, Misconfigured
