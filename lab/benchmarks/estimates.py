@@ -277,8 +277,9 @@ class TrialMap:
         self.photos = photos
         self._rows = photos.rows[self.members]
         scores = self._rows @ self._rows.T
-        self.background = measure_background(self._rows, self.match if photos.match else None)
         self.locations = [photos.locations[index] for index in self.members]
+        match = self.match if photos.match else None
+        self.background = measure_background(self._rows, self.locations, match)
         self.extent = MapExtent.of(self.locations, photos.scheme)
         self.own_photos = OwnPhotoSampler(
             self.locations,

@@ -6,6 +6,7 @@ queries measure what a new map answers before it has labelled queries.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,13 @@ import numpy as np
 from lab.datasets.dataset import DatasetPhoto, EvaluationSet
 from lab.datasets.utm_coordinates import parse_utm_grid, utm_to_degrees
 from lab.evaluation.exact_knn import Rankings, Rows, exact_knn
-from shared.evaluation.places.evidence import EVIDENCE_DEPTH, PhotoLocation, RankedPhoto
+from shared.evaluation.places.evidence import (
+    DIFFERENT_PLACE_M,
+    EVIDENCE_DEPTH,
+    PhotoLocation,
+    RankedPhoto,
+    is_same_place,
+)
 from shared.evaluation.places.figures import (
     REPORTED_CERTAINTIES,
     answer_figures,
@@ -138,12 +145,20 @@ def measure_places(
     }
 
 
-def measure_background(rows: Rows, match: MatchOwnPhoto | None = None) -> Background:
-    """Return what random pairs of (n, D) unit descriptors, and of their photos, score."""
+def measure_background(
+    rows: Rows, locations: Sequence[PhotoLocation] = (), match: MatchOwnPhoto | None = None
+) -> Background:
+    """Return what random pairs of (n, D) unit descriptors score.
+
+    And with `match`, how well photos of different locations match.
+    """
     pairs = np.random.default_rng(SEED).integers(len(rows), size=(RANDOM_PAIRS, 2))
     first, second = (pairs := pairs[pairs[:, 0] != pairs[:, 1]]).T
-    matched = pairs[:MATCHED_PAIRS].tolist()
-    supports = [match(photo, [other])[0] for photo, other in matched] if match else []
+    supports = [
+        match(photo, [other])[0]
+        for photo, other in (pairs[:MATCHED_PAIRS].tolist() if match else [])
+        if match and not is_same_place(locations[photo], locations[other], DIFFERENT_PLACE_M)
+    ]
     scores = np.einsum("nd,nd->n", rows[first], rows[second]).tolist()
     return Background.of(scores, [each for each in supports if each is not None])
 

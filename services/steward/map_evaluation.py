@@ -39,6 +39,7 @@ from shared.catalog.photos import PhotoRole
 from shared.catalog.vocabularies import vocabulary_standing
 from shared.errors import NotFound
 from shared.evaluation.places.evidence import (
+    DIFFERENT_PLACE_M,
     EVIDENCE_DEPTH,
     MATCHED_PHOTOS,
     RankedPhoto,
@@ -352,19 +353,21 @@ class MapEvaluation:
         return places, False if len(photos) >= MIN_PHOTOS_TO_DECIDE else None
 
     def _measure_background(self, sample: Sequence[GeotaggedPhoto]) -> Background:
-        """Return what random pairs of photos score, and how well they match."""
-        others = [
-            photo.photo_id for photo in _draw(self.database.photos, BACKGROUND_PHOTOS, seed=1)
-        ]
-        among = PhotoFilter(ids=tuple(others))
+        """Return what random pairs of photos score, and how well those of two places match."""
+        others = _draw(self.database.photos, BACKGROUND_PHOTOS, seed=1)
+        among = PhotoFilter(ids=tuple(other.photo_id for other in others))
         scores: list[float] = []
         supports: list[float | None] = []
         for number, photo in enumerate(_draw(sample, BACKGROUND_QUERIES, seed=2)):
             ranking = self.search.rank_similar(photo, len(others), among) or []
             scores += [hit.score for hit, _ in ranking]
             if self.matching != Matching.OFF:
-                pairs = set(others[number::BACKGROUND_QUERIES]) - {photo.photo_id}
-                supports += self.search.match(photo.photo_id, list(pairs))
+                apart = [
+                    other.photo_id
+                    for other in others[number::BACKGROUND_QUERIES]
+                    if not is_same_place(photo.spot, other.spot, DIFFERENT_PLACE_M)
+                ]
+                supports += self.search.match(photo.photo_id, apart)
         return Background.of(scores, [each for each in supports if each is not None])
 
     def _order_by_matches(

@@ -69,7 +69,7 @@ Coefficients = tuple[float, ...]
 
 
 class Background(BaseModel):
-    """Scores and matches of random pairs of photos of a map."""
+    """Scores of random pairs of photos of a map, and matches of those of different places."""
 
     model_config = ConfigDict(frozen=True)
 

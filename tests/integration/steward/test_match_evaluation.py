@@ -79,19 +79,24 @@ def test_photos_without_features_leave_it_open(city: EvaluatedMap) -> None:
     assert generation(city).uses_matches is None
 
 
-@pytest.mark.parametrize("scenes", [FEW_PLACES, 1])
-def test_an_evaluation_measures_how_well_random_pairs_of_photos_match(
-    city: EvaluatedMap, scenes: int
+@pytest.mark.parametrize(("degrees", "scenes"), [(1, FEW_PLACES), (1, 1), (0, 1)])
+def test_an_evaluation_measures_how_well_random_pairs_of_photos_of_different_places_match(
+    city: EvaluatedMap, degrees: int, scenes: int
 ) -> None:
-    publish_clustered(city, FEW_PLACES, scenes=scenes)
+    publish_clustered(city, FEW_PLACES, scenes=scenes, degrees=degrees)
     set_matching(city, Matching.ON)
     city.figures()
     background = model(city).model_dump()["elsewhere"]["background"]
-    assert (background["support"] > 20) == (scenes == 1)
+    assert (background["support"] > 20) == (scenes == degrees == 1)
 
 
 def publish_clustered(
-    city: EvaluatedMap, places: int = PLACES, *, with_features: bool = True, scenes: int = PLACES
+    city: EvaluatedMap,
+    places: int = PLACES,
+    *,
+    with_features: bool = True,
+    scenes: int = PLACES,
+    degrees: int = 1,
 ) -> None:
     """Photos of places at angles that overlap, with the points of their places."""
     rng = np.random.default_rng(0)
@@ -100,7 +105,7 @@ def publish_clustered(
     for number in numbers:
         place, walk = number // PER_PLACE, "abcd"[number % PER_PLACE]
         angle = 360 / places * place + NOISE_DEGREES * rng.normal()
-        seen.append((angle, at(place, filename=f"{walk}{place}.jpg")))
+        seen.append((angle, at(degrees * place, filename=f"{walk}{place}.jpg")))
     ids = city.publish(seen)
     if with_features:
         features = {
