@@ -107,7 +107,7 @@ def fit_place_model(
     if len(labelled) < MIN_LABELLED_QUERIES:
         labelled = ()
     if own < MIN_OWN_PHOTOS and not labelled:
-        return FittedPlaceModel(PlaceModel(), [], [])
+        return FittedPlaceModel(PlaceModel(extent=scores.extent), [], [])
     own_held_out, labelled_held_out = _predict_held_out(samples, labelled, scheme, scores)
     impostors = [s for s in own_held_out if s.left_out is not None]
     judged = labelled_held_out or own_held_out

@@ -145,7 +145,7 @@ def test_an_evaluation_writes_figures_rankings_and_a_report_that_fetches_nothing
     assert places["source"] == "prior", "ten photos are too few to fit the model on"
     assert places["samples"] == 6
     assert [each["certainty"] for each in places["answers"]] == [0.8, 0.9, 0.95, 0.99]
-    assert [each["level"] for each in places["levels"]] == [0, 1, 2, 3], "four radii"
+    assert [each["level"] for each in places["levels"]] == [0, 1], "a radius, and the whole map"
     stored = json.loads((out / "metrics.json").read_text())["sets"]["town"]
     assert (stored["recall"], stored["places"]) == (answer["recall"], places)
 
