@@ -151,8 +151,8 @@ class DecoderPool:
     def _start_pool(self) -> ProcessPool:
         is_remote = self._settings.s3_endpoint is not None
         store_module = "shared.storage.s3" if is_remote else "shared.storage"
-        prepare = functools.partial(prepare_process, store_module)
-        pool = limited_pool(self._settings.decode_processes, self._memory_bytes, prepare)
+        processes = self._settings.decode_processes
+        pool = limited_pool(processes, self._memory_bytes, prepare_process, store_module)
         pool.schedule(os.getpid)  # starts the processes; else the first photo would
         return pool
 

@@ -72,8 +72,7 @@ class OnnxProcess:
             is_stopping: Whether the caller's process is to stop; a running pass is then ended.
         """
         self._is_stopping = is_stopping
-        prepare = functools.partial(_prepare, data, threads)
-        self._pool = limited_pool(1, MEMORY_BYTES + len(data), prepare)
+        self._pool = limited_pool(1, MEMORY_BYTES + len(data), _prepare, data, threads)
         Finalize(self, _end, [self._pool], exitpriority=0)  # atexit does not run in children
 
     def open(self) -> None:

@@ -7,11 +7,4 @@ makes a worker look at the table sooner.
 from shared.catalog.jobs import Job, JobKind, JobState, Priority
 from shared.jobs.wakeups import InProcessWakeups, Wakeups
 
-__all__ = [
-    "InProcessWakeups",
-    "Job",
-    "JobKind",
-    "JobState",
-    "Priority",
-    "Wakeups",
-]
+__all__ = ["InProcessWakeups", "Job", "JobKind", "JobState", "Priority", "Wakeups"]

@@ -30,10 +30,4 @@ store, `shared.storage.ownership`) and `.placewise-hold` (garbage collection is 
 from shared.storage.folder import FolderStore
 from shared.storage.protocol import ObjectInfo, ObjectStore, ObjectWriter, OwnedStore
 
-__all__ = [
-    "FolderStore",
-    "ObjectInfo",
-    "ObjectStore",
-    "ObjectWriter",
-    "OwnedStore",
-]
+__all__ = ["FolderStore", "ObjectInfo", "ObjectStore", "ObjectWriter", "OwnedStore"]
