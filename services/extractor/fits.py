@@ -188,6 +188,9 @@ class FitWorker:
     def _run(self, job: Job, stop: threading.Event) -> None:
         self.HANDLERS[job.kind](self, job, stop)
 
+    def _reconstruct(self, job: Job, stop: threading.Event) -> None:
+        ReconstructionJob(self.context, job, stop).run()
+
     def _fit_vocabulary(self, job: Job, stop: threading.Event) -> None:
         extractor = map_extractor(self.context, job)
         if not extractor.config.needs_vocabulary:
@@ -295,5 +298,5 @@ class FitWorker:
     HANDLERS: ClassVar[dict[JobKind, Callable[[FitWorker, Job, threading.Event], None]]] = {
         JobKind.FIT: _fit_vocabulary,
         JobKind.PCA: _fit_whitening,
-        JobKind.RECONSTRUCT: lambda self, *job: ReconstructionJob(self.context, *job).run(),
+        JobKind.RECONSTRUCT: _reconstruct,
     }

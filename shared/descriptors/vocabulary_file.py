@@ -171,8 +171,9 @@ def decode_vocabulary(data: bytes) -> VocabularyFile:
             infos = archive.infolist()
             # Checked before reading: many members may overlap in the same bytes.
             if sorted(info.filename for info in infos) != sorted(ARCHIVE_MEMBERS):
-                first = ", ".join(sorted(info.filename for info in infos)[:3])
-                raise _vocabulary_unusable_error(f"it holds {first or 'nothing'}")
+                first, more = ", ".join(sorted(info.filename for info in infos)[:3]), len(infos) - 3
+                listed = f"{first} and {more} more" if more > 0 else first or "nothing"
+                raise _vocabulary_unusable_error(f"it holds {listed}")
             members = {info.filename: _read(archive, info) for info in infos}
     except (*ARRAY_READ_ERRORS, NotImplementedError, RuntimeError) as error:
         raise _vocabulary_unusable_error(f"it can't be read ({error})") from error

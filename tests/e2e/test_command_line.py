@@ -72,10 +72,7 @@ def indexed(server: ServerProcess, tmp_path_factory: pytest.TempPathFactory) -> 
     index = ("index", folder, "--utm-zone", "32T")
     without_fit = command(*index, "--map", "pooled", "--no-fit", "--json")
     listed = command("maps", "list", "--json").json()
-    assert {map_["name"]: map_["auto_fit"] for map_ in listed} == {
-        "default": True,
-        "pooled": False,
-    }
+    assert {map_["name"]: map_["auto_fit"] for map_ in listed} == {"default": True, "pooled": False}
     assert command("maps", "delete", "pooled", "--yes").code == 0
     for number in range(4, PHOTOS):
         (folder / "below" / f"{number}.JPG").write_bytes(photo_bytes(number))

@@ -82,8 +82,8 @@ class EvaluatedMap:
         return job.id
 
     def evaluator(self, search: SearchBackend | None = None) -> EvaluationWorker:
-        asked = search or self.search
-        return EvaluationWorker(self.catalog, self.store, asked, Settings(), "evaluator")
+        search = search or self.search
+        return EvaluationWorker(self.catalog, self.store, search, Settings(), "evaluator")
 
     def work(
         self, search: SearchBackend | None = None, stop: threading.Event | None = None

@@ -72,7 +72,7 @@ def read_photo_frames(folder: Path, timing: FrameTiming) -> list[SourceFrame]:
 def read_video_frames(video: Path, timing: FrameTiming, folder: Path) -> Iterator[SourceFrame]:
     """Decode a frame of a video every `timing.every_seconds` and write it to a folder as JPEG.
 
-    Frames are turned as players turn them. A file is deleted when the next frame is asked for.
+    Frames are turned as players turn them. A file is deleted when the next frame is requested.
 
     Raises:
         Misconfigured: `no_video_decoder`.

@@ -79,9 +79,9 @@ def _purge_next(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
         return False
     _purge_vocabulary_objects(catalog, store, map_id)
     with catalog.write() as session:
-        for of_map in (CachedMapStatistics, Evaluation, Job, Generation, Vocabulary):
-            session.execute(delete(of_map).where(of_map.map_id == map_id))
-        session.execute(delete(StoredWhitening).where(StoredWhitening.map_id == map_id))
+        tables = (CachedMapStatistics, Evaluation, Job, Generation, Vocabulary, StoredWhitening)
+        for table in tables:
+            session.execute(delete(table).where(table.map_id == map_id))
         # Not before the journal records it: else a rebuild of the catalog would restore the map.
         deleted = session.execute(delete(Map).where(Map.id == map_id, is_journaled(Map)))
     if affected_rows(deleted):

@@ -326,7 +326,8 @@ def level_features(
             neighbours_inside.mean(),
             *shared,
         ]
-    features += [0.0] * (len(FEATURES) - len(features))
+    else:
+        features += [0.0] * (len(FEATURES) - len(features))
     return np.array(features, dtype=np.float64)
 
 

@@ -50,8 +50,6 @@ IndexRanking = tuple[Indices, NDArray[np.float64]]
 """(k,) numbers of photos, best first, and their scores"""
 RankOwnPhoto = Callable[[int], IndexRanking | None]
 """Ranks the photos of the map by their similarity to one of them, without it."""
-IsCopy = Callable[[int, int], bool]
-"""Whether two photos are the same one, in other sizes or qualities."""
 MatchOwnPhoto = Callable[[int, Sequence[Hashable]], Sequence[float | None]]
 """Returns the `match_support` of a photo with each of others; None where they can't be compared."""
 
@@ -63,7 +61,8 @@ class OwnPhotoSampler:
         locations: The locations of the map's photos; those without a place are left out.
         position_radius_m: Radius of a place in metres.
         rank: Ranks these photos. Called once per photo.
-        is_copy: Called where no capture times tell two photos apart.
+        is_copy: Whether two photos are the same one, in other sizes or qualities; called where no
+            capture times tell them apart.
     """
 
     def __init__(
@@ -73,7 +72,7 @@ class OwnPhotoSampler:
         scheme: LevelScheme,
         position_radius_m: float,
         rank: RankOwnPhoto,
-        is_copy: IsCopy = lambda photo, other: False,
+        is_copy: Callable[[int, int], bool] = lambda photo, other: False,
     ) -> None:
         self._locations = locations
         self._scheme = scheme

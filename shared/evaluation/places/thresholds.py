@@ -90,13 +90,15 @@ def choose_threshold(estimates: Sequence[HeldOutEstimate], certainty: float) -> 
     """
     # The last level, the whole map, is no answer to where.
     depth = max([1, *(len(s.probabilities) - 1 for s in estimates)])
-    table = np.full((3, len(estimates), depth), -1.0)
+    probabilities = np.full((len(estimates), depth), -1.0)
+    known = np.zeros((len(estimates), depth))
+    wrong = np.zeros((len(estimates), depth))
     for row, estimate in enumerate(estimates):
-        levels = zip(estimate.probabilities[:-1], estimate.is_right, strict=False)
-        for position, (stated, right) in enumerate(levels):
-            table[:, row, position] = stated, right is not None, right is False
-    table[1:] *= np.array([estimate.weight for estimate in estimates])[:, None]
-    probabilities, known, wrong = table
+        finer = len(estimate.probabilities) - 1
+        probabilities[row, :finer] = estimate.probabilities[:finer]
+        for position, right in enumerate(estimate.is_right[:finer]):
+            known[row, position] = 0.0 if right is None else estimate.weight
+            wrong[row, position] = estimate.weight if right is False else 0.0
     floor = max(0.5, 1 - MAX_ERROR_FACTOR * (1 - certainty))
     unseen = max(floor, 2 * certainty - 1)
     distinct = np.unique(probabilities[probabilities >= floor])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import multiprocessing
 import os
 import resource
 import signal
@@ -157,7 +158,8 @@ def test_photos_are_read_as_they_are_decoded(
 def test_too_many_pixels_are_refused_by_the_settings_limit(settings: Settings) -> None:
     with pool_with(settings, max_image_pixels=100) as pool:
         (outcome,) = pool.decode([GOOD], SQUARE)
-    assert outcome.code == "too_many_pixels"  # type: ignore[union-attr]
+    assert isinstance(outcome, Unprocessable)
+    assert outcome.code == "too_many_pixels"
 
 
 @pytest.mark.parametrize(("colour", "reason"), [(CRASHES, "crashed"), (HANGS, "within 2 s")])
@@ -255,5 +257,6 @@ def test_decoder_processes_have_a_memory_limit_and_import_no_torch_nor_start_a_t
 def test_closing_the_pool_ends_its_processes(settings: Settings) -> None:
     with pool_with(settings) as pool:
         child = in_child(pool, "__import__('os').getpid()")
+    assert child not in {process.pid for process in multiprocessing.active_children()}
     with pytest.raises(ProcessLookupError):
         os.kill(child, 0)

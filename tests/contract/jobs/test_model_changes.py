@@ -50,7 +50,10 @@ def test_a_second_model_change_is_refused_and_names_the_first(
         first = start_model_change(session, map_id, JobKind.FIT, {"seed": 0}).id
         start_model_change(session, other, JobKind.FIT, {"seed": 0})  # each map has its own
     for kind in MODEL_CHANGE_JOBS:
-        with pytest.raises(Conflict, match=r"/cancel\?map=") as refused, catalog.write() as session:
+        with (
+            pytest.raises(Conflict, match=rf"{first}/cancel\?map=") as refused,
+            catalog.write() as session,
+        ):
             start_model_change(session, map_id, kind, {})
         assert refused.value.code == "model_change_running"
         assert refused.value.extra == {"job_id": str(first)}

@@ -122,12 +122,7 @@ class TestFolderStoreWithOriginalsElsewhere(ObjectStoreContract):
         files = {
             path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()
         }
-        assert files == {
-            "photos/1",
-            "photos/deep/2",
-            "objects/chunks/3",
-            "objects/originals-too/4",
-        }
+        assert files == {"photos/1", "photos/deep/2", "objects/chunks/3", "objects/originals-too/4"}
         assert keys_of(store, "orig") == ["originals-too/4", "originals/1", "originals/deep/2"]
         assert keys_of(store, "originals/d") == ["originals/deep/2"]
 

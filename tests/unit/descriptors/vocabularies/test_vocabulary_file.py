@@ -93,7 +93,9 @@ def broken_archives() -> dict[str, bytes]:
         "does not name the features it was fitted on": npz(centres=centres, provenance=text({})),
         "does not name the features": npz(centres=centres, provenance=text(["a list"])),
         "it holds centres.npy. Import centres alone as a .npy file, or": npz(centres=centres),
-        "vocabulary export`: it holds a.npy, b.npy, c.npy.": npz(a=b"", b=b"", c=b"", d=b""),
+        "vocabulary export`: it holds a.npy, b.npy, c.npy and 1 more.": npz(
+            a=b"", b=b"", c=b"", d=b""
+        ),
         "it holds nothing": npz(),
         "it holds centres.npy, code.npy": npz(centres=centres, provenance=provenance, code=b"x"),
         "centres.npy is compressed": compressed,
